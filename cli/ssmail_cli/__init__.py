@@ -1,0 +1,1 @@
+"""The `ssmail` command line: it parses, calls ssmail, and prints; it computes nothing."""
