@@ -274,7 +274,7 @@ def _read_yaml(path: Path) -> Any:
 
 
 class _Loader(yaml.SafeLoader):
-    """Safe YAML where 1e-3 is a number (PyYAML reads text) and a key given twice is an error (PyYAML keeps the last)."""
+    """Safe YAML where 1e-3 is a number (PyYAML: text) and a key given twice an error (PyYAML: the last one holds)."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
