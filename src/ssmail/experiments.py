@@ -225,15 +225,17 @@ def _check_keys(leaves: Mapping[str, Any], source: str) -> None:
 
 
 def _nearest_key(key: str, known: Mapping[str, bool]) -> str:
-    """The nearest full key; else the key with the same last part; else the keys of its section; else the sections."""
+    """The nearest key of the section; else one with the same last part; else the nearest of all; else the choices."""
     values = [name for name, section in known.items() if not section]
-    near = difflib.get_close_matches(key, values, n=1, cutoff=0.75)
-    near = near or [name for name in values if name.rpartition(".")[2] == key.rpartition(".")[2]]
+    section, _, last = key.rpartition(".")
+    siblings = {name.rpartition(".")[2]: name for name in known if name.rpartition(".")[0] == section}
+    near = [siblings[name] for name in difflib.get_close_matches(last, siblings, n=1)]
+    near = near or [name for name in values if name.rpartition(".")[2] == last]
+    near = near or ([] if siblings else difflib.get_close_matches(key, values, n=1))
     if near:
         return f"did you mean {near[0]}?"
-    section = key.rpartition(".")[0]
-    siblings = [name for name in known if name.rpartition(".")[0] == section]
-    return f"choose from {', '.join(siblings or [name for name in known if '.' not in name])}."
+    choices = siblings.values() or [name for name in known if "." not in name]
+    return f"choose from {', '.join(choices)}."
 
 
 def _shown(value: Any) -> str:
