@@ -1,0 +1,43 @@
+# The only entry for people and CI. Each target makes .venv when it is missing or older than what it is made from.
+SHELL := bash
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.PHONY: help venv demo test test-slow check bench clean
+.DEFAULT_GOAL := help
+
+help:  ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+
+venv: $(INSTALLED)  ## the virtual environment, with the versions of constraints.txt
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "ssmail needs Python 3.11 or newer; give one with: make PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: $(INSTALLED)  ## train SS-AIL on the Y-Junction (a few minutes) and draw its figures
+	$(BIN)/ssmail train --method ssail --profile quick --seeds 0
+	$(BIN)/ssmail plot fig5 fig4
+	@echo "Look at results/figures/: fig5.png shows the learned trajectories, fig4.png the error over the epochs."
+
+test: $(INSTALLED)  ## the tests, without the slow ones
+	$(BIN)/pytest -m "not slow"
+
+test-slow: $(INSTALLED)  ## the slow tests (minutes)
+	$(BIN)/pytest -m slow
+
+check: $(INSTALLED)  ## lint, format and types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+bench: $(INSTALLED)  ## how long the command line, an epoch and the store take
+	$(BIN)/python benchmarks/run.py
+
+clean:  ## remove caches and build outputs; .venv and results/ stay
+	rm -rf .mypy_cache .ruff_cache .pytest_cache .hypothesis build dist
+	find src cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
