@@ -1,0 +1,52 @@
+"""Scaling of positions and velocities to [-1, 1] (appendix B; DNRI's protocol: one scalar range for each)."""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """One scalar minimum and maximum of the training positions, and one of the velocities, over all axes."""
+
+    position_min: float
+    position_max: float
+    velocity_min: float
+    velocity_max: float
+
+    @classmethod
+    def fit(cls, positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> Self:
+        """Ranges of arrays of any shape in raw units. Raises ValueError when a range is empty or not finite."""
+        scaling = cls(*(float(f(x)) for x in (positions, velocities) for f in (np.min, np.max)))
+        spans = (scaling.position_span, scaling.velocity_span)
+        if not all(np.isfinite(s) and s > 0 for s in spans):
+            raise ValueError(f"positions and velocities need a positive finite range, not {spans}")
+        return scaling
+
+    @property
+    def position_span(self) -> float:
+        """Raw length that two scaled units stand for."""
+        return self.position_max - self.position_min
+
+    @property
+    def velocity_span(self) -> float:
+        """Raw speed that two scaled units stand for."""
+        return self.velocity_max - self.velocity_min
+
+    def scale_positions(self, raw: Any) -> Any:
+        """Raw to scaled positions; arrays and tensors of any shape."""
+        return 2 * (raw - self.position_min) / self.position_span - 1
+
+    def scale_velocities(self, raw: Any) -> Any:
+        """Raw to scaled velocities; arrays and tensors of any shape."""
+        return 2 * (raw - self.velocity_min) / self.velocity_span - 1
+
+    def unscale_positions(self, scaled: Any) -> Any:
+        """Scaled to raw positions; inverse of `scale_positions`."""
+        return (scaled + 1) * (self.position_span / 2) + self.position_min
+
+    def unscale_velocities(self, scaled: Any) -> Any:
+        """Scaled to raw velocities; inverse of `scale_velocities`."""
+        return (scaled + 1) * (self.velocity_span / 2) + self.velocity_min

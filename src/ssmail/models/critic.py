@@ -1,0 +1,45 @@
+"""Twin critics of G-SAC: one pass, two independent sets of weights."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.models.message_passing import TypedMessages
+
+
+class TwinLinear(nn.Module):
+    """Two linear layers side by side: (..., 2, D) -> (..., 2, H)."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        bound = 1 / math.sqrt(inputs)
+        self.weight = nn.Parameter(torch.empty(2, inputs, outputs).uniform_(-bound, bound))
+        self.bias = nn.Parameter(torch.empty(2, outputs).uniform_(-bound, bound))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Apply weight k to x[..., k, :]."""
+        return torch.einsum("...kd,kdh->...kh", x, self.weight) + self.bias
+
+
+class TwinCritic(nn.Module):
+    """Q_1 and Q_2 of each agent, given all agents' states and actions and the graph.
+
+    Each agent has its own return (the discriminator scores every agent), learned from the messages of all others.
+    """
+
+    def __init__(self, inputs: int, hidden: int, edge_types: int, first_is_none: bool) -> None:
+        super().__init__()
+        self.messages = nn.ModuleList(TypedMessages(inputs, hidden, edge_types, first_is_none) for _ in range(2))
+        self.first = TwinLinear(hidden + inputs, hidden)
+        self.second = TwinLinear(hidden, hidden)
+        self.last = TwinLinear(hidden, 1)
+
+    def forward(self, x: Tensor, action: Tensor, graph: Tensor) -> Tensor:
+        """x (..., N, D), action (..., N, A), graph (..., N, N, K) -> (..., N, 2)."""
+        inputs = torch.cat([x, action], dim=-1)
+        h = torch.stack([torch.cat([m(inputs, graph), inputs], dim=-1) for m in self.messages], dim=-2)
+        h = nn.functional.silu(self.first(h))
+        h = nn.functional.silu(self.second(h))
+        q: Tensor = self.last(h).squeeze(-1)
+        return q

@@ -1,0 +1,23 @@
+"""The discriminator D(s, a): a score for every agent, 0 = generated, 1 = expert (section 3.1)."""
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.models.message_passing import EdgeFunction, mean_over_senders
+
+
+class Discriminator(nn.Module):
+    """One round of messages over the complete graph, then a perceptron with an unbounded scalar output."""
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        super().__init__()
+        self.edges = EdgeFunction(inputs, hidden, hidden)
+        self.head = nn.Sequential(
+            nn.Linear(hidden + inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, 1)
+        )
+
+    def forward(self, x: Tensor, action: Tensor) -> Tensor:
+        """x (..., N, D) and action (..., N, A) -> (..., N)."""
+        inputs = torch.cat([x, action], dim=-1)
+        out: Tensor = self.head(torch.cat([mean_over_senders(self.edges(inputs)), inputs], dim=-1))
+        return out.squeeze(-1)

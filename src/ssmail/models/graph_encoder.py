@@ -1,0 +1,86 @@
+"""The graph encoder (section 3.2.1): node -> edge -> node -> edge messages, an LSTM per edge, a softmax over edge types.
+
+As in the paper there is no prior network. How the graph is *sampled* is left open there, and it matters: the sampled graph is all
+the randomness that a whole group shares. A graph is the arg max of logits plus Gumbel noise; `GraphNoise` says for how many edges and for how long
+one draw holds. With one draw for all edges and the whole trajectory the marginal distribution of every edge at every step is still
+exactly the softmax, but the group commits to one graph and so to one of the expert's modes (docs/paper.md).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
+
+Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
+
+
+class GraphEncoder(nn.Module):
+    """Logits of the K edge types of every ordered pair, given the history so far."""
+
+    def __init__(self, inputs: int, hidden: int, edge_types: int) -> None:
+        super().__init__()
+        self.edges_in = EdgeFunction(inputs, hidden, hidden)
+        self.nodes = perceptron(hidden + inputs, hidden, hidden)
+        self.edges_out = EdgeFunction(hidden, hidden, hidden)
+        self.lstm = nn.LSTM(hidden, hidden, batch_first=True)
+        self.head = nn.Linear(hidden, edge_types)
+
+    def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
+        """x (B, T, N, D) -> logits (B, T, N, N, K) and the memory after the last step; step t reads x[:, : t + 1] only."""
+        b, t, n, _ = x.shape
+        edges = self.edges_in(x)
+        nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
+        edges = nn.functional.silu(self.edges_out(nodes) + edges)
+        sequences = off_diagonal(edges).transpose(1, 2).reshape(b * n * (n - 1), t, -1)
+        embedded, memory = self.lstm(sequences, memory)
+        logits = self.head(embedded).view(b, n * (n - 1), t, -1).transpose(1, 2)
+        return on_diagonal(logits, n), memory
+
+
+def off_diagonal(pairs: Tensor) -> Tensor:
+    """(B, T, N, N, H) -> (B, T, N * (N - 1), H): the edges between different agents, row by row."""
+    b, t, n, _, h = pairs.shape
+    return pairs.reshape(b, t, n * n, h)[:, :, 1:].view(b, t, n - 1, n + 1, h)[:, :, :, :n].reshape(b, t, n * (n - 1), h)
+
+
+def on_diagonal(edges: Tensor, agents: int) -> Tensor:
+    """Inverse of `off_diagonal`, with zeros on the diagonal."""
+    b, t, _, h = edges.shape
+    n = agents
+    rows = nn.functional.pad(edges.view(b, t, n - 1, n, h), (0, 0, 0, 1)).view(b, t, (n - 1) * (n + 1), h)
+    return nn.functional.pad(rows, (0, 0, 1, 0)).view(b, t, n, n, h)
+
+
+@dataclass(frozen=True)
+class GraphNoise:
+    """How the Gumbel noise of a graph is shared.
+
+    shared: "shared" gives all edges of a graph one draw, "edge" gives each its own.
+    resample: "trajectory" keeps the draw for a whole trajectory, "step" renews it at every step.
+    """
+
+    shared: Literal["shared", "edge"]
+    resample: Literal["trajectory", "step"]
+
+    def draw(self, batch: int, steps: int, agents: int, edge_types: int, generator: torch.Generator) -> Tensor:
+        """Gumbel noise that broadcasts to (B, T, N, N, K): axes over which it is shared have length 1."""
+        n = 1 if self.shared == "shared" else agents
+        t = 1 if self.resample == "trajectory" else steps
+        uniform = torch.rand(batch, t, n, n, edge_types, generator=generator)
+        return -torch.log(-torch.log(uniform.clamp(1e-6, 1 - 1e-6)))
+
+
+def sample_graph(logits: Tensor, noise: Tensor, temperature: float) -> Tensor:
+    """One-hot edge types (..., K) = arg max(logits + Gumbel noise), with the gradient of the softmax at `temperature` (straight-through)."""
+    soft = torch.softmax((logits + noise) / temperature, dim=-1)
+    hard = nn.functional.one_hot(soft.argmax(dim=-1), soft.shape[-1]).to(soft.dtype)
+    return hard + soft - soft.detach()
+
+
+def graph_entropy(logits: Tensor) -> Tensor:
+    """Entropy in nats of the edge-type distribution, averaged over everything; 0 .. log K."""
+    log_p = torch.log_softmax(logits, dim=-1)
+    return -(log_p.exp() * log_p).sum(dim=-1).mean()

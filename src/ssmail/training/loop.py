@@ -1,0 +1,202 @@
+"""The training loop: epochs of rollouts and updates, validation, the best model, and everything needed to continue later.
+
+It yields metrics and knows nothing of where they are stored.
+"""
+
+import math
+import time
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssmail.data.expert_file import load
+from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
+from ssmail.data.yjunction import generate
+from ssmail.envs.integrator import Integrator
+from ssmail.errors import SsmailError
+from ssmail.evaluation.protocol import constant_velocity, full_metrics, quick_metrics
+from ssmail.models.features import Features
+from ssmail.models.policy import GraphPolicy
+from ssmail.spec import DataSpec, RunSpec
+from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.curricula import draw_interventions, intervention_frequency, mean_segment_length
+from ssmail.training.replay import Batch, Replay
+from ssmail.training.rollout import rollout
+from ssmail.training.seeding import Generators
+
+
+class Divergence(SsmailError):
+    """Training left the finite numbers."""
+
+
+def expert_set(spec: DataSpec) -> ExpertSet:
+    """The expert data of a spec: its file, or the generator's set when it names none."""
+    return generate(spec.yjunction) if spec.path is None else load(Path(spec.path))
+
+
+class TrainingLoop:
+    """One run. Call `run_epoch` until `epoch` reaches spec.training.epochs, then `final_evaluation`."""
+
+    def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
+        self.spec, self.device = spec, torch.device(device)
+        self.data = expert_set(spec.data)
+        self.dataset_hash = self.data.hash
+        self.scaling = self.data.scaling
+        self.generators = Generators(seed)
+        self.experts = self._scaled(self.data.train)
+        self.steps = self.experts.actions.shape[1]
+        self.features = Features(spec.model.time_input, spec.model.start_input, self.steps + 1)
+        self.integrator = Integrator(self.scaling)
+        self.learner = AdversarialLearner(spec, self.experts, self.features, self.integrator, self.generators)
+        self.replay = Replay(spec.training.replay)
+        self.epoch = 0
+        self.improved = False
+        self.best_error = math.inf
+        self.best_epoch = 0
+        self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
+
+    def run_epoch(self) -> dict[str, float]:
+        """One epoch of Alg. 1 and its validation; returns the epoch's metrics. Raises Divergence when weights stop being finite."""
+        began = time.perf_counter()
+        epochs = self.spec.training.epochs
+        frequency = intervention_frequency(self.spec.curriculum, self.epoch, epochs)
+        self.learner.set_learning_rates(self._learning_rate_factor())
+        latest, segment = self._generate(frequency)
+        self.replay.add(latest)
+        updates = [self.learner.update(latest, self.replay) for _ in range(self.spec.training.updates)]
+        values = {name: float(np.mean([u[name] for u in updates])) for name in updates[0]}
+        self._check_finite()
+        values |= {"curriculum/intervention_frequency": frequency, "curriculum/segment_length": segment}
+        values |= self._validate()
+        self.epoch += 1
+        error = values["validation/mode_mse"]
+        self.improved = error < self.best_error
+        if self.improved:
+            self.best_error, self.best_epoch = error, self.epoch
+            self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
+        return values | {"seconds": time.perf_counter() - began}
+
+    def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Metrics of the best-validation model on the test split (sampled, mean), of the last model, and of constant velocity; and the arrays to draw."""
+        truth, lines = self.data.test, self.data.centre_lines
+        best = deepcopy(self.learner.evaluated_policy())
+        best.load_state_dict(self.best_weights)
+        sampled = self._samples(best, truth)
+        candidates = {
+            "test": sampled,
+            "test_mean": self._samples(best, truth, deterministic=True),
+            "test_last": self._samples(self.learner.evaluated_policy(), truth),
+            "test_constant_velocity": constant_velocity(truth)[None],
+        }
+        values = {"best_epoch": float(self.best_epoch)}
+        for prefix, samples in candidates.items():
+            values |= {f"{prefix}/{k}": v for k, v in full_metrics(samples, truth, lines, self.scaling).items()}
+        arrays = {
+            "test/rollouts": sampled.astype(np.float32),
+            "test/expert": truth.positions.astype(np.float32),
+            "test/lanes": truth.continuations.astype(np.float32),
+            "train/expert": self.data.train.positions.astype(np.float32),
+            "train/lane": self.data.train.mode,
+            "lane_centres": lines.astype(np.float32),
+        }
+        return values, arrays
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue as if never interrupted: tensors and plain data only."""
+        return {
+            "epoch": self.epoch,
+            "best": {"error": self.best_error, "epoch": self.best_epoch, "weights": self.best_weights},
+            "learner": self.learner.state_dict(),
+            "replay": self.replay.state_dict(),
+            "generators": self.generators.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`, for a loop made with the same spec and seed."""
+        self.epoch = state["epoch"]
+        best = state["best"]
+        self.best_error, self.best_epoch, self.best_weights = best["error"], best["epoch"], best["weights"]
+        self.learner.load_state_dict(state["learner"])
+        self.replay.load_state_dict(state["replay"])
+        self.generators.load_state_dict(state["generators"])
+
+    def best_state_dict(self) -> dict[str, Any]:
+        """The policy of the best validation error so far, with its epoch and error."""
+        return {"epoch": self.best_epoch, "error": self.best_error, "policy": self.best_weights}
+
+    def _scaled(self, trajectories: Trajectories) -> Batch:
+        """Scaled states (B, T, N, 2P) and the actions (B, T - 1, N, P) that led from each to the next."""
+        velocities = self.scaling.scale_velocities(trajectories.velocities)
+        states = np.concatenate([self.scaling.scale_positions(trajectories.positions), velocities], axis=-1)
+        to = {"dtype": torch.float32, "device": self.device}
+        source = torch.arange(len(trajectories), device=self.device)
+        return Batch(torch.as_tensor(states).to(**to), torch.as_tensor(velocities[:, 1:]).to(**to), source)  # type: ignore[arg-type]
+
+    def _learning_rate_factor(self) -> float:
+        """1 up to decay_start, then linearly down to learning_rate_final in the last epoch."""
+        training = self.spec.training
+        progress = self.epoch / max(training.epochs - 1, 1)
+        decayed = max(progress - training.decay_start, 0) / max(1 - training.decay_start, 1e-9)
+        return 1 - min(decayed, 1) * (1 - training.learning_rate_final)
+
+    def _generate(self, frequency: float) -> tuple[Batch, float]:
+        """tau_G from random training starts under the curriculum, and their mean segment length."""
+        count = self.spec.training.rollouts
+        source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
+        interventions = draw_interventions(count, self.steps, frequency, self.generators["curriculum"])
+        expert = self.experts.states[source]
+        made = rollout(
+            self.learner.policy,
+            self.features,
+            self.integrator,
+            expert[:, 0],
+            self.steps,
+            self.generators["policy"],
+            expert=expert,
+            interventions=interventions.to(self.device) if frequency > 0 else None,
+        )
+        return Batch(made.states, made.actions, source), mean_segment_length(interventions)
+
+    def _check_finite(self) -> None:
+        for network in (self.learner.policy, self.learner.critic, self.learner.discriminator):
+            if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
+                raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
+
+    def _validate(self) -> dict[str, float]:
+        """Free-running sampled rollouts from every validation start and from some training starts."""
+        count = min(self.spec.evaluation.train_rollouts, len(self.data.train))
+        chosen = torch.randperm(len(self.data.train), generator=self.generators["evaluation"])[:count].numpy()
+        train = Trajectories(
+            self.data.train.positions[chosen],
+            self.data.train.velocities[chosen],
+            self.data.train.mode[chosen],
+            self.data.train.continuations[:, chosen],
+        )
+        validation = self.data.validation
+        start = torch.cat([self._scaled(validation).states[:, 0], self._scaled(train).states[:, 0]])
+        positions = self._free_run(self.learner.evaluated_policy(), start)
+        values = {}
+        parts = {"validation": (positions[: len(validation)], validation), "train": (positions[len(validation) :], train)}
+        for split, (predicted, truth) in parts.items():
+            measured = quick_metrics(predicted, truth, self.data.centre_lines, self.scaling)
+            values |= {f"{split}/{k}": v for k, v in measured.items()}
+        return values
+
+    def _free_run(self, policy: GraphPolicy, start: Tensor, deterministic: bool = False) -> Floats:
+        """Raw positions (B, T, N, P) of one free-running rollout from each start (B, N, D), the start included."""
+        generator = self.generators["evaluation"]
+        made = rollout(policy, self.features, self.integrator, start, self.steps, generator, deterministic=deterministic)
+        scaled = made.states[..., : policy.action_size].double().cpu().numpy()
+        raw: Floats = self.scaling.unscale_positions(scaled)
+        return raw
+
+    def _samples(self, policy: GraphPolicy, truth: Trajectories, deterministic: bool = False) -> Floats:
+        """(S, B, T, N, P) raw positions: S rollouts of every start."""
+        start = self._scaled(truth).states[:, 0]
+        s = self.spec.evaluation.samples
+        positions = self._free_run(policy, start.repeat(s, 1, 1), deterministic)
+        return positions.reshape(s, len(truth), *positions.shape[1:])

@@ -1,0 +1,29 @@
+"""One seed -> independent generators, so that e.g. a change of the alpha range leaves the initial weights as they were."""
+
+from typing import Any
+
+import numpy as np
+import torch
+
+PURPOSES = ("data", "weights", "policy", "alpha", "curriculum", "evaluation")
+
+
+class Generators:
+    """One torch generator for each purpose: data order, initial weights, policy noise, alpha, interventions, evaluation rollouts."""
+
+    def __init__(self, seed: int) -> None:
+        children = np.random.SeedSequence(seed).spawn(len(PURPOSES))
+        self.seeds = {p: int(c.generate_state(1, np.uint64)[0] >> 1) for p, c in zip(PURPOSES, children, strict=True)}
+        self.by_purpose = {p: torch.Generator().manual_seed(s) for p, s in self.seeds.items()}
+
+    def __getitem__(self, purpose: str) -> torch.Generator:
+        return self.by_purpose[purpose]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The states of all generators."""
+        return {p: g.get_state() for p, g in self.by_purpose.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        for purpose, generator in self.by_purpose.items():
+            generator.set_state(state[purpose])
