@@ -1,0 +1,190 @@
+"""From a path or URL to an engine on a database of the current schema, and the two kinds of transaction.
+
+SQLite is used in WAL mode: readers never wait. Writers take turns: each write transaction begins with BEGIN IMMEDIATE and
+waits there, up to BUSY_SECONDS, so that no later statement can meet a lock.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, select, table, text
+from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
+
+from ssmail.errors import InputError, SsmailError
+from ssmail.store.schema import REVISIONS, metadata
+
+BUSY_SECONDS = 120.0
+_MIGRATIONS = Path(__file__).parent / "migrations"
+
+
+def connect(where: str | Path) -> Engine:
+    """An engine on the database at `where` (a path, or an SQLAlchemy URL), created or upgraded if need be.
+
+    Raises InputError when it cannot be created or read, is no database of ssmail's, or has a newer schema.
+    """
+    url = _as_url(where)
+    if url.get_backend_name() == "sqlite":
+        _prepare_path(url)
+    try:
+        engine = _engine(url)
+    except (NoSuchModuleError, ImportError) as error:
+        raise InputError(
+            f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
+        ) from error
+    try:
+        if not _is_current(engine):
+            _upgrade(engine)
+    except DBAPIError as error:
+        engine.dispose()
+        raise _translated(error, engine) from error
+    except SsmailError:
+        engine.dispose()
+        raise
+    return engine
+
+
+@contextmanager
+def reading(engine: Engine) -> Iterator[Connection]:
+    """A connection for reading one consistent state of the database; never waits for a writer."""
+    try:
+        with engine.connect() as connection:
+            yield connection
+    except DBAPIError as error:
+        raise _translated(error, engine) from error
+
+
+@contextmanager
+def writing(engine: Engine) -> Iterator[Connection]:
+    """A short write transaction: waits for its turn, then holds the only write lock until the block ends."""
+    try:
+        with engine.connect() as connection:
+            connection = connection.execution_options(writes=True)
+            with connection.begin():
+                yield connection
+    except DBAPIError as error:
+        raise _translated(error, engine) from error
+
+
+def describe(engine: Engine) -> str:
+    """The database's path, or its URL without the password, for messages."""
+    return _show(engine.url)
+
+
+def _show(url: URL) -> str:
+    if url.get_backend_name() == "sqlite" and url.database:
+        return url.database
+    return url.render_as_string(hide_password=True)
+
+
+def _as_url(where: str | Path) -> URL:
+    if isinstance(where, Path) or "://" not in where:
+        return URL.create("sqlite", database=str(Path(where).expanduser().absolute()))
+    try:
+        url = make_url(where)
+    except ArgumentError as error:
+        raise InputError(f"{where!r} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from error
+    if url.get_backend_name() != "sqlite":
+        return url
+    if url.database in (None, "", ":memory:"):
+        raise InputError(f"{where!r} is a database in memory, which is lost at once; give the path of a file")
+    return url.set(database=str(Path(str(url.database)).absolute()))
+
+
+def _prepare_path(url: URL) -> None:
+    path = Path(str(url.database))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot create the folder {path.parent} for the database ({error.strerror}); choose a writable place"
+        ) from error
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
+
+
+def _engine(url: URL) -> Engine:
+    if url.get_backend_name() != "sqlite":
+        return create_engine(url, isolation_level="SERIALIZABLE")
+    engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
+
+    @event.listens_for(engine, "connect")
+    def _configure(dbapi_connection: Any, _record: Any) -> None:
+        dbapi_connection.isolation_level = None  # the driver begins no transaction of its own: `_begin` does
+        dbapi_connection.execute("PRAGMA foreign_keys = ON")
+
+    @event.listens_for(engine, "begin")
+    def _begin(connection: Connection) -> None:
+        writes = connection.get_execution_options().get("writes", False)
+        connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+
+    return engine
+
+
+def _is_current(engine: Engine) -> bool:
+    """Whether the schema is the newest known one; raises InputError when this version of ssmail cannot use it."""
+    with engine.connect() as connection:
+        revision = _revision(connection, engine)
+    return revision == REVISIONS[-1]
+
+
+def _revision(connection: Connection, engine: Engine) -> str | None:
+    """The schema revision, or None in an empty database."""
+    tables = set(inspect(connection).get_table_names())
+    if not tables:
+        return None
+    version_table = "alembic_version"
+    if version_table not in tables or not tables & set(metadata.tables):
+        raise InputError(f"{describe(engine)} is a database of another program; give ssmail a file of its own")
+    revision = connection.execute(select(text("version_num")).select_from(table(version_table))).scalar()
+    if revision not in REVISIONS:
+        raise InputError(
+            f"{describe(engine)} was written by a newer ssmail (schema {revision}, this one knows up to "
+            f"{REVISIONS[-1]}); upgrade ssmail or use another database"
+        )
+    return str(revision)
+
+
+def _upgrade(engine: Engine) -> None:
+    from alembic import command  # imported here because a database is seldom upgraded, and often opened
+    from alembic.config import Config
+
+    if engine.dialect.name == "sqlite":
+        _use_wal(engine)
+    config = Config()
+    config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
+    with writing(engine) as connection:
+        if _revision(connection, engine) != REVISIONS[-1]:  # another process may have been faster
+            config.attributes["connection"] = connection
+            command.upgrade(config, "head")
+
+
+def _use_wal(engine: Engine) -> None:
+    """Switch the file to WAL mode for good. SQLite does not wait for a lock here, hence the loop."""
+    deadline = time.monotonic() + BUSY_SECONDS
+    connection = engine.raw_connection()
+    try:
+        while True:
+            try:
+                connection.cursor().execute("PRAGMA journal_mode = WAL")
+                return
+            except Exception as error:
+                if "locked" not in str(error) or time.monotonic() > deadline:
+                    raise DBAPIError("PRAGMA journal_mode = WAL", None, error) from error
+                time.sleep(0.01)
+    finally:
+        connection.close()
+
+
+def _translated(error: DBAPIError, engine: Engine) -> SsmailError:
+    """One sentence for what the database driver refused."""
+    where, reason = describe(engine), str(error.orig)
+    if "not a database" in reason or "malformed" in reason:
+        return InputError(f"{where} is not an SQLite database, or a damaged one ({reason}); give another file")
+    if "unable to open" in reason or "readonly" in reason:
+        return InputError(f"cannot write the database {where} ({reason}); choose a writable place")
+    if "locked" in reason:
+        return SsmailError(f"another program kept the database {where} to itself for {BUSY_SECONDS:.0f} s; close it")
+    return SsmailError(f"the database {where} refused an operation: {reason}")

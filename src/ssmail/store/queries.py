@@ -1,0 +1,169 @@
+"""Reading the store: runs, metrics as data frames, arrays, artifacts. Functions of an open connection."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import Connection, Select, select
+
+from ssmail.errors import InputError
+from ssmail.store import arrays, schema
+from ssmail.store.schema import RunState
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """One row of the table `run`; docs/database.md explains each column. Times are in UTC."""
+
+    id: str
+    method: str
+    environment: str
+    profile: str
+    seed: int
+    spec_json: str = field(repr=False)
+    spec_hash: str
+    dataset_hash: str | None
+    state: RunState
+    error: str | None
+    started: datetime
+    finished: datetime | None
+    heartbeat: datetime
+    owner: str = field(repr=False)
+    resumes: int
+    git_commit: str | None
+    git_dirty: bool | None
+    package_version: str
+    torch_version: str
+    device: str
+    host: str
+    wall_seconds: float
+    cpu_seconds: float
+    peak_memory_bytes: int | None
+
+    @property
+    def name(self) -> str:
+        """The first eight digits of the id, enough for people."""
+        return self.id[:8]
+
+    @cached_property
+    def spec(self) -> dict[str, Any]:
+        """The run's spec as plain nested values."""
+        parsed: dict[str, Any] = json.loads(self.spec_json)
+        return parsed
+
+
+@dataclass(frozen=True)
+class ArtifactRow:
+    """A file that a run left behind; `path` is absolute, and the file may have been deleted since."""
+
+    run_id: str
+    name: str
+    path: Path
+    sha256: str
+    size_bytes: int
+
+
+def runs(connection: Connection, *conditions: Any) -> list[RunRow]:
+    """The runs that meet all conditions, newest last."""
+    query = select(schema.run).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
+    return [_run_row(row) for row in connection.execute(query).mappings()]
+
+
+def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow | None:
+    """The newest run of the cell, or None."""
+    found = runs(connection, schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
+    return found[-1] if found else None
+
+
+def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
+    """The full id for each id or unambiguous beginning of one. Raises InputError for an unknown or ambiguous one."""
+    return [_resolve_one(connection, prefix.strip().lower()) for prefix in prefixes]
+
+
+def metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
+    """Every recorded value: run_id, seed, name, step, value; ordered by run start, name and step."""
+    table, run = schema.metric, schema.run
+    query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
+    query = query.join(run, run.c.id == table.c.run_id)
+    query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
+    return _frame(connection, _selected(query, table, run_ids, names), ["run_id", "seed", "name", "step", "value"])
+
+
+def latest_metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
+    """The last value of each metric: run_id, name, step, value; ordered by run start and name."""
+    table, run = schema.metric_latest, schema.run
+    query = select(table.c.run_id, table.c.name, table.c.step, table.c.value, table.c.kind)
+    query = query.join(run, run.c.id == table.c.run_id).order_by(run.c.started, run.c.id, table.c.name)
+    return _frame(connection, _selected(query, table, run_ids, names), ["run_id", "name", "step", "value"])
+
+
+def array(connection: Connection, run_id: str, name: str) -> npt.NDArray[Any]:
+    """The array of that name. Raises InputError, naming those there are, when the run has none."""
+    table = schema.array
+    query = select(table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run_id, table.c.name == name)
+    row = connection.execute(query).one_or_none()
+    if row is None:
+        there = ", ".join(array_names(connection, run_id)) or "none"
+        raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {there}")
+    return arrays.decode(row.dtype, row.shape, row.data)
+
+
+def array_names(connection: Connection, run_id: str) -> list[str]:
+    """The names of the run's arrays, sorted."""
+    table = schema.array
+    return list(
+        connection.execute(select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)).scalars()
+    )
+
+
+def artifacts(connection: Connection, run_id: str, root: Path) -> list[ArtifactRow]:
+    """The run's files, by name; relative paths are taken from `root`."""
+    table = schema.artifact
+    query = select(table).where(table.c.run_id == run_id).order_by(table.c.name)
+    return [
+        ArtifactRow(row["run_id"], row["name"], root / row["path"], row["sha256"], row["size_bytes"])
+        for row in connection.execute(query).mappings()
+    ]
+
+
+def _run_row(row: Any) -> RunRow:
+    values = {item.name: row[item.name] for item in fields(RunRow)}
+    return RunRow(**{**values, "state": RunState(values["state"])})
+
+
+def _resolve_one(connection: Connection, prefix: str) -> str:
+    run = schema.run
+    query = select(run.c.id).where(run.c.id.startswith(prefix, autoescape=True)).limit(2)
+    found = list(connection.execute(query).scalars()) if prefix else []
+    if not found:
+        raise InputError(f"no run has an id that begins with {prefix!r}; `ssmail runs list` shows them")
+    if len(found) > 1:
+        raise InputError(f"several runs have an id that begins with {prefix!r}; give more of its digits")
+    return str(found[0])
+
+
+def _selected(query: Select[Any], table: Any, run_ids: Sequence[str], names: Sequence[str] | None) -> Select[Any]:
+    query = query.where(table.c.run_id.in_(list(run_ids)))
+    return query if names is None else query.where(table.c.name.in_(list(names)))
+
+
+def _frame(connection: Connection, query: Select[Any], columns: list[str]) -> "pd.DataFrame":
+    import pandas as pd  # imported here because listing runs must not wait for it
+
+    rows = connection.execute(query).all()
+    frame = pd.DataFrame(rows, columns=[*columns, "kind"])
+    value = frame["value"].astype(float).to_numpy(copy=True)
+    value[(frame["kind"] == "nan").to_numpy()] = np.nan
+    value[(frame["kind"] == "inf").to_numpy()] = np.inf
+    value[(frame["kind"] == "-inf").to_numpy()] = -np.inf
+    integers = {name: "int64" for name in ("seed", "step") if name in columns}
+    return frame.assign(value=value).astype(integers)[columns]

@@ -1,0 +1,129 @@
+"""Writing one run: metrics, arrays, artifacts, heartbeats and its end, in short transactions.
+
+Each transaction first touches the run's row: only when the run is RUNNING and this writer still owns it does it go on.
+So a finished run cannot change, and a process that was given up for dead cannot write into the run another one resumed.
+"""
+
+import hashlib
+import math
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
+from sqlalchemy.exc import IntegrityError
+
+from ssmail.errors import SsmailError
+from ssmail.store import arrays, origin, schema
+from ssmail.store.connection import writing
+from ssmail.store.schema import RunState
+
+
+class RunWriter:
+    """The only hand that writes a run; get one from Store.start_run or Store.resume_run."""
+
+    def __init__(self, engine: Engine, checkpoint_root: Path, run_id: str, owner: str, used: Mapping[str, Any]) -> None:
+        self.run_id = run_id
+        self._engine = engine
+        self._checkpoint_root = checkpoint_root
+        self._owner = owner
+        self._used = dict(used)  # wall_seconds, cpu_seconds, peak_memory_bytes of the processes before this one
+        self._wall, self._cpu = time.monotonic(), time.process_time()
+
+    def epoch(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Record the metrics of epoch `step` (1-based). Raises SsmailError when one of them is recorded already."""
+        with writing(self._engine) as connection:
+            self._touch(connection)
+            try:
+                _insert(connection, schema.metric, self.run_id, step, metrics)
+            except IntegrityError as error:
+                raise SsmailError(f"run {self.run_id[:8]} already has metrics of step {step}") from error
+            self._replace_latest(connection, step, metrics)
+
+    def final(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Record the metrics of the final evaluation, replacing those of an evaluation that was cut short."""
+        with writing(self._engine) as connection:
+            self._touch(connection)
+            _delete(connection, schema.metric, self.run_id, list(metrics))
+            _insert(connection, schema.metric, self.run_id, step, metrics)
+            self._replace_latest(connection, step, metrics)
+
+    def heartbeat(self) -> None:
+        """Tell the store that this run is alive. Safe to call from another thread."""
+        with writing(self._engine) as connection:
+            self._touch(connection)
+
+    def arrays(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
+        """Store each named array, replacing one of the same name."""
+        rows = [{"run_id": self.run_id, "name": name, **arrays.encode(value)} for name, value in values.items()]
+        self._replace(schema.array, rows)
+
+    def artifact(self, name: str, path: Path) -> None:
+        """Record the file at `path` under `name`, with its SHA-256; its path is kept relative to the checkpoint root."""
+        content = path.read_bytes()
+        try:
+            stored = path.resolve().relative_to(self._checkpoint_root.resolve())
+        except ValueError:
+            stored = path.resolve()
+        digest = hashlib.sha256(content).hexdigest()
+        row = {"name": name, "path": stored.as_posix(), "sha256": digest, "size_bytes": len(content)}
+        self._replace(schema.artifact, [{"run_id": self.run_id, **row}])
+
+    def finish(self, state: RunState, error: str | None = None) -> None:
+        """End the run in `state`, any but QUEUED and RUNNING; after this the writer can write no more."""
+        if state in (RunState.QUEUED, RunState.RUNNING):
+            raise SsmailError(f"a run cannot end in the state {state}")
+        with writing(self._engine) as connection:
+            self._touch(connection, state=state, error=error, finished=datetime.now(UTC))
+
+    def _touch(self, connection: Connection, **changes: Any) -> None:
+        run = schema.run
+        mine = (run.c.id == self.run_id) & (run.c.owner == self._owner) & (run.c.state == RunState.RUNNING)
+        values = {"heartbeat": datetime.now(UTC), **self._resources(), **changes}
+        if connection.execute(update(run).where(mine).values(values)).rowcount == 1:
+            return
+        state = connection.execute(select(run.c.state).where(run.c.id == self.run_id)).scalar()
+        if state is None:
+            raise SsmailError(f"run {self.run_id[:8]} was deleted while it was being written")
+        if state == RunState.RUNNING:
+            raise SsmailError(f"run {self.run_id[:8]} was resumed by another process, which now owns it")
+        raise SsmailError(f"run {self.run_id[:8]} is {state} and can no longer be written")
+
+    def _resources(self) -> dict[str, Any]:
+        return {
+            "wall_seconds": self._used["wall_seconds"] + time.monotonic() - self._wall,
+            "cpu_seconds": self._used["cpu_seconds"] + time.process_time() - self._cpu,
+            "peak_memory_bytes": max(self._used["peak_memory_bytes"] or 0, origin.peak_memory_bytes()),
+        }
+
+    def _replace(self, table: Table, rows: list[dict[str, Any]]) -> None:
+        with writing(self._engine) as connection:
+            self._touch(connection)
+            _delete(connection, table, self.run_id, [row["name"] for row in rows])
+            if rows:
+                connection.execute(insert(table), rows)
+
+    def _replace_latest(self, connection: Connection, step: int, metrics: Mapping[str, float]) -> None:
+        _delete(connection, schema.metric_latest, self.run_id, list(metrics))
+        _insert(connection, schema.metric_latest, self.run_id, step, metrics)
+
+
+def _delete(connection: Connection, table: Table, run_id: str, names: list[str]) -> None:
+    connection.execute(delete(table).where(table.c.run_id == run_id, table.c.name.in_(names)))
+
+
+def _insert(connection: Connection, table: Table, run_id: str, step: int, metrics: Mapping[str, float]) -> None:
+    rows = [{"run_id": run_id, "name": name, "step": step, **_value(value)} for name, value in metrics.items()]
+    if rows:
+        connection.execute(insert(table), rows)
+
+
+def _value(value: float) -> dict[str, Any]:
+    """The columns value and kind: SQLite would turn NaN into NULL, and other databases refuse infinities."""
+    number = float(value)
+    if math.isfinite(number):
+        return {"value": number, "kind": "finite"}
+    return {"value": None, "kind": "nan" if math.isnan(number) else "inf" if number > 0 else "-inf"}
