@@ -55,23 +55,28 @@ class _Layer(NamedTuple):
 
 
 def build_spec(
-    method: str, environment: str, profile: str, overrides: Sequence[str] = (), file: Path | None = None
+    method: str,
+    environment: str,
+    profile: str,
+    overrides: Sequence[str] = (),
+    file: Path | None = None,
+    source: str = "--set",
 ) -> RunSpec:
     """Merge the layers of experiments.yaml and validate the result.
 
     Each override is "key.path=value" with a YAML value; later ones win. `file` replaces the experiments.yaml that is
-    found. Raises InputError, one sentence, for an unknown name or key (it names the nearest), a value of the wrong type
-    or out of range, and a file that cannot be read.
+    found; `source` is what a sentence calls the place of the overrides. Raises InputError, one sentence, for an unknown
+    name or key (it names the nearest), a value of the wrong type or out of range, and a file that cannot be read.
     """
     experiments = load_experiments(file)
     layers = _file_layers(experiments, method, environment, profile)
-    layers += [_Layer("--set", _parse_override(text)) for text in overrides]
+    layers += [_Layer(source, _parse_override(text)) for text in overrides]
     merged: dict[str, Any] = {}
     origins: dict[str, str] = {}
     for layer in layers:
-        leaves = dict(_leaves(layer.values))
-        _check_keys(leaves, layer.source)
-        origins.update(dict.fromkeys(leaves, layer.source))
+        given = dict(leaves(layer.values))
+        _check_keys(given, layer.source)
+        origins.update(dict.fromkeys(given, layer.source))
         merged = _merge(merged, layer.values)
     try:
         return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
@@ -107,6 +112,15 @@ def load_experiments(file: Path | None = None) -> Experiments:
         if not isinstance(content.get(name), dict):
             raise InputError(f"section '{name}' of {path} is missing or no mapping; compare with the shipped one.")
     return Experiments(path=path, **content)
+
+
+def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of every value that is not a mapping with keys."""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
@@ -184,15 +198,6 @@ def _parse_override(text: str) -> dict[str, Any]:
     return dict(parsed)
 
 
-def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """(dotted key, value) of every value that is not a mapping with keys."""
-    for key, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
-
-
 def _merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(weak)
     for key, value in strong.items():
@@ -210,9 +215,9 @@ def _spec_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, 
             yield from _spec_keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]  # checked above
 
 
-def _check_keys(leaves: Mapping[str, Any], source: str) -> None:
+def _check_keys(given: Mapping[str, Any], source: str) -> None:
     known = {key: section for key, section in _spec_keys(RunSpec) if key not in _ARGUMENTS}
-    for key, value in leaves.items():
+    for key, value in given.items():
         if key in _ARGUMENTS:
             raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
         if key not in known:
