@@ -1,7 +1,7 @@
 """From a path or URL to an engine on a database of the current schema, and the two kinds of transaction.
 
-SQLite is used in WAL mode: readers never wait. Writers take turns: each write transaction begins with BEGIN IMMEDIATE and
-waits there, up to BUSY_SECONDS, so that no later statement can meet a lock.
+SQLite is used in WAL mode: readers never wait. Writers take turns: each write transaction begins with BEGIN IMMEDIATE,
+and waits there, up to BUSY_SECONDS, so that no later statement can meet a lock.
 """
 
 import time

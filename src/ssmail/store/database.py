@@ -57,8 +57,8 @@ class Store:
     ) -> list[RunRow]:
         """The runs that meet every condition given, newest last.
 
-        `figure` keeps the runs of the environment and methods that experiments.yaml lists for that figure; `ids` are ids
-        or their beginnings. Raises InputError for an unknown figure and for an unknown or ambiguous id.
+        `figure` keeps the runs of the environment and methods that experiments.yaml lists for that figure; `ids` are
+        ids or their beginnings. Raises InputError for an unknown figure and for an unknown or ambiguous id.
         """
         run = schema.run
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}

@@ -62,7 +62,7 @@ class RunWriter:
         self._replace(schema.array, rows)
 
     def artifact(self, name: str, path: Path) -> None:
-        """Record the file at `path` under `name`, with its SHA-256; its path is kept relative to the checkpoint root."""
+        """Record the file at `path` under `name`, with its SHA-256; its path is kept relative to the checkpoints."""
         content = path.read_bytes()
         try:
             stored = path.resolve().relative_to(self._checkpoint_root.resolve())
