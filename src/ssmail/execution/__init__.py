@@ -1,1 +1,1 @@
-""""""
+"""Where runs are computed. `ssmail.execution.local` runs cells in processes of this machine."""

@@ -11,7 +11,7 @@ from sqlalchemy import Engine
 
 from ssmail.spec import RunSpec
 from ssmail.store import lifecycle, origin, queries, schema
-from ssmail.store.connection import connect, reading, writing
+from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.lifecycle import STALE_SECONDS
 from ssmail.store.queries import ArtifactRow, RunRow
 from ssmail.store.schema import RunState
@@ -22,11 +22,16 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """An open store. Many processes may use one database at once; each opens its own Store."""
+    """An open store. Many processes may use one database at once; each opens its own Store.
+
+    url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
+    checkpoint_root: the folder with one subfolder of checkpoints for each run id, beside an SQLite file.
+    """
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self.url = engine.url.render_as_string(hide_password=False)
+        self.where = describe(engine)
         on_sqlite = engine.dialect.name == "sqlite"
         folder = Path(str(engine.url.database)).parent if on_sqlite else Path("results").absolute()
         self.checkpoint_root = folder / "checkpoints"
