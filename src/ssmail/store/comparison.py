@@ -63,7 +63,8 @@ def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> lis
         specs.setdefault(run.spec_hash, []).append(run)
     differences = _differences({spec: found[0].spec for spec, found in specs.items()})
     frame = store.latest_metrics([run.id for run in newest.values()], metrics)
-    latest = {(row.run_id, row.name): float(row.value) for row in frame.itertuples()}
+    keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
+    latest: dict[tuple[str, str], float] = dict(zip(keys, frame["value"].tolist(), strict=True))
     return [
         _comparison(sorted(found, key=lambda run: run.seed), differences[spec], metric, latest)
         for spec, found in specs.items()

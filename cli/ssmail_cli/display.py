@@ -1,0 +1,123 @@
+"""How results look on stdout: a table for people, CSV or JSON for programs. And how notes go to stderr."""
+
+import csv
+import json
+import math
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+Row = Mapping[str, Any]
+
+
+class Format(StrEnum):
+    """How rows are printed."""
+
+    TABLE = "table"
+    CSV = "csv"
+    JSON = "json"
+
+
+def chosen_format(as_json: bool, chosen: Format | None) -> Format:
+    """What the user asked for; else a table on a terminal and CSV elsewhere."""
+    if as_json:
+        return Format.JSON
+    return chosen or (Format.TABLE if sys.stdout.isatty() else Format.CSV)
+
+
+def note(text: str) -> None:
+    """A remark beside the result: one line on stderr."""
+    print(text, file=sys.stderr)
+
+
+def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
+    """Print rows; `columns` maps the keys that a table shows to headings. CSV and JSON have every key of the rows."""
+    if form is Format.TABLE:
+        _print_table(rows, columns)
+    elif form is Format.CSV:
+        write_csv(rows, list(rows[0]) if rows else list(columns), None)
+    else:
+        write_json(list(rows), None)
+
+
+def write_csv(rows: Iterable[Row], columns: Sequence[str], out: Path | None) -> None:
+    """CSV with a header, to a file or (None) to stdout; None is empty, NaN is nan, times are ISO 8601."""
+
+    def write(file: Any) -> None:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([_csv_cell(row.get(column)) for column in columns] for row in rows)
+
+    _to(out, write)
+
+
+def write_json(value: Any, out: Path | None) -> None:
+    """JSON to a file or (None) to stdout; NaN and infinities become the texts nan, inf and -inf, as JSON has none."""
+    _to(out, lambda file: print(json.dumps(_json_value(value), indent=2), file=file))
+
+
+def short(value: Any) -> str:
+    """A value as a table shows it: four significant digits, minutes of UTC, a dash for nothing."""
+    if value is None or value == "":
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, datetime):
+        return f"{value:%Y-%m-%d %H:%M}"
+    return str(value)
+
+
+def _print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for key, heading in columns.items():
+        numeric = any(isinstance(row.get(key), int | float) for row in rows)
+        table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(_plain(short(row.get(key))) for key in columns))
+    Console(soft_wrap=False).print(table)
+
+
+def _plain(text: str) -> Any:
+    """Text that Rich must not read as markup."""
+    from rich.text import Text
+
+    return Text(text)
+
+
+def _csv_cell(value: Any) -> Any:
+    if isinstance(value, datetime):
+        return value.isoformat(timespec="seconds")
+    return json.dumps(_json_value(value)) if isinstance(value, Mapping | list | tuple) else value
+
+
+def _json_value(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _json_value(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_json_value(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    if isinstance(value, datetime):
+        return value.isoformat(timespec="seconds")
+    return str(value) if isinstance(value, Path) else value
+
+
+def _to(out: Path | None, write: Any) -> None:
+    from ssmail.errors import InputError
+
+    if out is None:
+        write(sys.stdout)
+        return
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with out.open("w", encoding="utf-8", newline="") as file:
+            write(file)
+    except OSError as error:
+        raise InputError(f"{out} cannot be written: {error.strerror}; choose another --out.") from None

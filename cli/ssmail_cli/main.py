@@ -1,0 +1,85 @@
+"""The Typer application: which commands there are, and how any failure ends (one line on stderr and an exit code)."""
+
+import difflib
+import os
+import re
+import sys
+from typing import Annotated
+
+import typer
+
+from ssmail import __version__
+from ssmail.errors import SsmailError
+from ssmail_cli import data, plot, runs, train
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="ssmail",
+    help="Run, store and redraw the experiments of SS-MAIL (Self-Supervised Multi-Agent Imitation Learning).",
+    epilog="Exit codes: 0 done, 1 failure, 2 wrong usage or input, 3 some runs did not finish, 130 interrupted.",
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("generate-yjunction")(data.generate_yjunction)
+app.command("train")(train.train)
+app.command("plot")(plot.plot)
+app.add_typer(runs.app, name="runs")
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"ssmail {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """The options of ssmail itself."""
+
+
+def main() -> None:
+    """The entry point `ssmail`."""
+    sys.exit(run(sys.argv[1:]))
+
+
+def run(arguments: list[str]) -> int:
+    """Run one command line and return its exit code; a failure prints one line, and a traceback with SSMAIL_DEBUG=1."""
+    try:
+        code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
+        sys.stdout.flush()
+    except SsmailError as error:
+        return _complain(str(error), error.exit_code)
+    except (KeyboardInterrupt, typer.Abort):
+        return _complain("interrupted", INTERRUPTED)
+    except BrokenPipeError:  # the reader of stdout, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
+            return _complain(_usage(error.format_message()), 2)
+        if os.environ.get("SSMAIL_DEBUG"):
+            raise
+        what = " ".join(str(error).split())
+        return _complain(f"unexpected {type(error).__name__}: {what} (SSMAIL_DEBUG=1 shows the traceback)", 1)
+    return code if isinstance(code, int) else 0
+
+
+def _complain(sentence: str, code: int) -> int:
+    print(f"ssmail: {sentence}", file=sys.stderr)
+    return code
+
+
+def _usage(message: str) -> str:
+    """Typer's complaint as one sentence on one line, with the nearest option alone."""
+    sentence = " ".join(message.split()).replace("Value error, ", "").replace(": Input should", ": it should")
+    misspelt = re.match(r"No such option: (\S+) \(Possible options: (.*)\)$", sentence)
+    if misspelt:
+        nearest = difflib.get_close_matches(misspelt[1], misspelt[2].split(", "), n=1, cutoff=0)
+        return f"no such option {misspelt[1]}; did you mean {nearest[0]}?"
+    return sentence[:1].lower() + sentence[1:]

@@ -1,0 +1,260 @@
+"""`ssmail runs`: list, show, compare, export and delete what the store holds."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ssmail.errors import InputError
+from ssmail_cli import options
+from ssmail_cli.display import Format, chosen_format, note, print_rows, write_csv, write_json
+from ssmail_cli.results import KEY_METRICS, rows_with_metrics, run_row
+
+if TYPE_CHECKING:
+    from ssmail.store import RunRow, Store
+    from ssmail.store.comparison import Comparison
+
+app = typer.Typer(help="List, show, compare, export and delete stored runs.", rich_markup_mode=None)
+
+RUN_COLUMNS = {
+    "run": "run",
+    "state": "state",
+    "method": "method",
+    "environment": "env",
+    "profile": "profile",
+    "seed": "seed",
+    "spec_hash": "spec",
+    "started": "started (UTC)",
+    "wall_seconds": "seconds",
+    "test/mode_mse": "mode_mse",
+}
+COMPARE_COLUMNS = {
+    "method": "method",
+    "environment": "env",
+    "profile": "profile",
+    "spec_hash": "spec",
+    "differs": "differs in",
+    "metric": "metric",
+    "finished": "finished",
+    "mean": "mean",
+    "std": "std",
+    "median": "median",
+    "seeds": "each seed",
+}
+EXPORT_COLUMNS = ("run_id", "method", "environment", "profile", "seed", "state", "spec_hash", "name", "step", "value")
+
+
+@app.command("list")
+def list_runs(
+    ids: options.RunIds = None,
+    method: options.Method = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    state: options.State = None,
+    figure: options.Figure = None,
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """List runs with their test error.
+
+    The newest comes last; CSV and JSON have every column.
+    """
+    store = options.open_store(db)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    if not runs:
+        note(f"no run in {db} meets these conditions")
+    print_rows(rows_with_metrics(store, runs, ["test/mode_mse"]), RUN_COLUMNS, chosen_format(as_json, form))
+
+
+@app.command()
+def show(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="The id of a run, or its first digits.")],
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Show everything about one run.
+
+    Its columns, its spec, the last value of each metric, its arrays and its files.
+    """
+    store = options.open_store(db)
+    (found,) = store.runs(ids=[run])
+    kind = chosen_format(as_json, form)
+    if kind is Format.JSON:
+        write_json(_details(store, found), None)
+        return
+    columns = {"section": "", "name": "", "step": "step", "value": "value"}
+    print_rows(list(_detail_rows(_details(store, found))), columns, kind)
+
+
+@app.command()
+def compare(
+    ids: options.RunIds = None,
+    metrics: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="Compare this metric; repeatable.", show_default=", ".join(KEY_METRICS)),
+    ] = None,
+    method: options.Method = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    state: options.State = None,
+    figure: options.Figure = None,
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Compare specs over their seeds.
+
+    Shows mean, standard deviation (n - 1), median and the value of each seed's newest run. Runs that differ in the seed
+    alone are one group. No run is left out: one without the metric shows its state.
+    """
+    from ssmail.store.comparison import compare as compare_runs
+
+    store = options.open_store(db)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    if not runs:
+        note(f"no run in {db} meets these conditions")
+    found = compare_runs(store, runs, metrics or KEY_METRICS)
+    for metric in metrics or ():
+        if runs and not any(item.known for item in found if item.metric == metric):
+            raise InputError(
+                f"no run compared here has a metric '{metric}'; `ssmail runs show RUN` lists those it has."
+            )
+    kind = chosen_format(as_json, form)
+    seeds = sorted({seed for item in found for seed in item.values})
+    rows = [_comparison_row(item, seeds, kind) for item in found]
+    columns = {
+        key: heading for key, heading in COMPARE_COLUMNS.items() if key != "differs" or any(i.differs for i in found)
+    }
+    print_rows(rows, columns, kind)
+
+
+@app.command()
+def export(
+    ids: options.RunIds = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="The file to write, replacing it.", show_default="stdout")
+    ] = None,
+    method: options.Method = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    state: options.State = None,
+    figure: options.Figure = None,
+    as_json: options.Json = False,
+    form: Annotated[
+        Format, typer.Option("--format", help="csv: a line for each value; json: runs with specs and metrics.")
+    ] = Format.CSV,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Export every metric of every epoch."""
+    if form is Format.TABLE:
+        raise InputError("an export is csv or json, not a table; `ssmail runs list` prints tables.")
+    store = options.open_store(db)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    if as_json or form is Format.JSON:
+        write_json([{**run_row(run), "spec": run.spec, "metrics": _metrics(store, run)} for run in runs], out)
+    else:
+        write_csv(_export_rows(store, runs), EXPORT_COLUMNS, out)
+    note(f"exported {len(runs)} run{'' if len(runs) == 1 else 's'}{f' to {out}' if out else ''}")
+
+
+@app.command()
+def delete(
+    ids: Annotated[list[str], typer.Argument(metavar="RUN...", help="Ids of runs, or their first digits.")],
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without asking.")] = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Delete runs and their checkpoints.
+
+    Everything that they recorded goes; a run that is being computed is refused.
+    """
+    import sys
+
+    store = options.open_store(db)
+    runs = store.runs(ids=ids)
+    names = ", ".join(f"{run.name} ({run.method}, seed {run.seed}, {run.state})" for run in runs)
+    if not yes:
+        if not sys.stdin.isatty():
+            raise InputError(f"nothing is deleted without a yes; give --yes to delete {names}.")
+        if not typer.confirm(f"Delete {names}?", err=True):
+            note("nothing deleted")
+            raise typer.Exit(1)
+    store.delete([run.id for run in runs])
+    note(f"deleted {names}")
+
+
+def _metrics(store: "Store", run: "RunRow") -> list[dict[str, Any]]:
+    """Every recorded value of a run: name, step, value."""
+    frame = store.metrics([run.id])
+    return [
+        {"name": name, "step": step, "value": value}
+        for name, step, value in zip(*(frame[key].tolist() for key in ("name", "step", "value")), strict=True)
+    ]
+
+
+def _export_rows(store: "Store", runs: "list[RunRow]") -> Iterator[dict[str, Any]]:
+    for run in runs:
+        columns = {"run_id": run.id, **run_row(run)}
+        yield from ({**columns, **value} for value in _metrics(store, run))
+
+
+def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
+    latest = store.latest_metrics([run.id])
+    metrics = zip(*(latest[key].tolist() for key in ("name", "step", "value")), strict=True)
+    return {
+        "run": run_row(run),
+        "spec": run.spec,
+        "metrics": [{"name": name, "step": step, "value": value} for name, step, value in metrics],
+        "arrays": store.array_names(run.id),
+        "artifacts": [
+            {"name": item.name, "path": item.path, "sha256": item.sha256, "size_bytes": item.size_bytes}
+            for item in store.artifacts(run.id)
+        ],
+    }
+
+
+def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The same, flat: section, name, step (of a metric), value."""
+    from ssmail.experiments import leaves
+
+    for section in ("run", "spec"):
+        for name, value in leaves(details[section]):
+            yield {"section": section, "name": name, "step": None, "value": value}
+    for metric in details["metrics"]:
+        yield {"section": "metric", **metric}
+    for name in details["arrays"]:
+        yield {"section": "array", "name": name, "step": None, "value": None}
+    for item in details["artifacts"]:
+        yield {"section": "artifact", "name": item["name"], "step": None, "value": item["path"]}
+
+
+def _comparison_row(item: "Comparison", seeds: list[int], kind: Format) -> dict[str, Any]:
+    """One group and metric. A seed without a value shows its run's state in its place."""
+    from ssmail_cli.display import short
+
+    each = {seed: item.states[seed].value if value is None else value for seed, value in item.values.items()}
+    row = {
+        "method": item.method,
+        "environment": item.environment,
+        "profile": item.profile,
+        "spec_hash": item.spec_hash,
+        "differs": dict(item.differs),
+        "metric": item.metric,
+        "runs": len(item.values),
+        "values": len(item.known),
+        "mean": item.mean,
+        "std": item.std,
+        "median": item.median,
+    }
+    if kind is Format.JSON:
+        return {**row, "seeds": each}
+    if kind is Format.CSV:
+        return {**row, **{f"seed_{seed}": each.get(seed) for seed in seeds}}
+    return {
+        **row,
+        "differs": " ".join(f"{key}={short(value)}" for key, value in item.differs.items()),
+        "finished": f"{len(item.known)}/{len(item.values)}",
+        "seeds": "  ".join(f"{seed}: {short(value)}" for seed, value in each.items()),
+    }
