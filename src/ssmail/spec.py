@@ -110,6 +110,7 @@ class TrainingSpec(Frozen):
     epochs: Count
     updates: Count  # SAC steps in each epoch
     batch: Count  # trajectories in a batch
+    time_steps: Count  # random time steps of each trajectory that an update uses (only the encoder needs whole sequences)
     rollouts: Count  # trajectories generated in each epoch
     replay: Count  # generated trajectories kept
     learning_rate_final: Fraction  # the last epoch's learning rates, as a fraction of the first's (linear decay)

@@ -30,8 +30,13 @@ class Actor(nn.Module):
         low, high = self.log_std_range
         return mean, low + (high - low) * torch.sigmoid(raw)
 
-    def act(self, x: Tensor, graph: Tensor, velocity: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions (..., N, A) and their log-probabilities (..., N), for standard normal `noise` (..., N, A) and the current velocity.
+    def sample(self, x: Tensor, graph: Tensor, velocity: Tensor, noise: Tensor) -> Tensor:
+        """Actions (..., N, A) for standard normal `noise` (..., N, A) and the current velocity; zero noise gives the mean action."""
+        mean, log_std = self.distribution(x, graph)
+        return self.squash(mean + log_std.exp() * noise, velocity)
+
+    def sample_with_log_prob(self, x: Tensor, graph: Tensor, velocity: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """The actions of `sample` and their log-probabilities (..., N), in scaled velocity units.
 
         log p(a) = sum over axes of log N(u; mean, std) - log d - log(1 - tanh(u)^2); the last term in its stable form.
         """
@@ -42,6 +47,6 @@ class Actor(nn.Module):
         return self.squash(u, velocity), (gaussian - jacobian).sum(dim=-1)
 
     def squash(self, u: Tensor, velocity: Tensor) -> Tensor:
-        """The action of an unsquashed u; with u = mean this is the deterministic policy."""
+        """The action of an unsquashed u."""
         inner = self.bound - self.step
         return velocity.clamp(-inner, inner) + self.step * torch.tanh(u)

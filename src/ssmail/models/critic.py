@@ -39,7 +39,7 @@ class TwinCritic(nn.Module):
         """x (..., N, D), action (..., N, A), graph (..., N, N, K) -> (..., N, 2)."""
         inputs = torch.cat([x, action], dim=-1)
         h = torch.stack([torch.cat([m(inputs, graph), inputs], dim=-1) for m in self.messages], dim=-2)
-        h = nn.functional.silu(self.first(h))
-        h = nn.functional.silu(self.second(h))
+        h = torch.relu(self.first(h))
+        h = torch.relu(self.second(h))
         q: Tensor = self.last(h).squeeze(-1)
         return q

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.message_passing import EdgeFunction, mean_over_senders
+from ssmail.models.message_passing import EdgeFunction
 
 
 class Discriminator(nn.Module):
@@ -19,5 +19,5 @@ class Discriminator(nn.Module):
     def forward(self, x: Tensor, action: Tensor) -> Tensor:
         """x (..., N, D) and action (..., N, A) -> (..., N)."""
         inputs = torch.cat([x, action], dim=-1)
-        out: Tensor = self.head(torch.cat([mean_over_senders(self.edges(inputs)), inputs], dim=-1))
+        out: Tensor = self.head(torch.cat([self.edges.messages(inputs), inputs], dim=-1))
         return out.squeeze(-1)

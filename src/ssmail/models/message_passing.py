@@ -14,11 +14,14 @@ def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, outputs))
 
 
+def others(agents: int, like: Tensor) -> Tensor:
+    """(N, N, 1) weights of the mean over senders: 1 / (N - 1) off the diagonal, 0 on it."""
+    return (1 - torch.eye(agents, dtype=like.dtype, device=like.device)).unsqueeze(-1) / max(agents - 1, 1)
+
+
 def mean_over_senders(pairs: Tensor) -> Tensor:
     """(..., N, N, H) -> (..., N, H): the mean over i != j; zeros for a single agent."""
-    n = pairs.shape[-2]
-    others = 1 - torch.eye(n, dtype=pairs.dtype, device=pairs.device)
-    return torch.einsum("...ijh,ij->...jh", pairs, others / max(n - 1, 1))
+    return (pairs * others(pairs.shape[-2], pairs)).sum(dim=-3)
 
 
 class PairLayer(nn.Module):
@@ -35,7 +38,7 @@ class PairLayer(nn.Module):
 
 
 class EdgeFunction(nn.Module):
-    """A two-layer edge function f_e([x_i, x_j]): x (..., N, D) -> (..., N, N, H)."""
+    """A two-layer edge function f_e([x_i, x_j])."""
 
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
@@ -43,15 +46,20 @@ class EdgeFunction(nn.Module):
         self.second = nn.Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Edge embeddings h_(i,j)."""
-        out: Tensor = self.second(nn.functional.silu(self.first(x)))
+        """Edge embeddings h_(i,j): x (..., N, D) -> (..., N, N, H)."""
+        out: Tensor = self.second(torch.relu(self.first(x)))
+        return out
+
+    def messages(self, x: Tensor) -> Tensor:
+        """Their mean over senders: x (..., N, D) -> (..., N, H). The second layer is linear, so it is applied after the mean."""
+        out: Tensor = self.second(mean_over_senders(torch.relu(self.first(x))))
         return out
 
 
 class TypedMessages(nn.Module):
     """Messages sum_k z_ijk f_e^k([x_i, x_j]), averaged over senders (section 3.2.2).
 
-    The second layer of every f_e^k is linear, so it is applied after the mean: K * N products instead of N * N * K.
+    The second layer of every f_e^k is linear, so it is applied after the mean: N products instead of N * N.
     With `first_is_none` the first type has no function: no message flows along its edges.
     """
 
@@ -59,15 +67,14 @@ class TypedMessages(nn.Module):
         super().__init__()
         self.skipped = int(first_is_none)
         self.types = edge_types - self.skipped
-        self.hidden = hidden
         self.first = PairLayer(inputs, hidden * self.types)
         self.second = nn.Linear(hidden * self.types, hidden, bias=False)
         self.type_bias = nn.Linear(self.types, hidden, bias=False)
 
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
         """x (..., N, D) and graph (..., N, N, K) -> (..., N, H)."""
-        weights = graph[..., self.skipped :]
-        embedded = nn.functional.silu(self.first(x)).unflatten(-1, (self.types, self.hidden))
-        weighted = (embedded * weights.unsqueeze(-1)).flatten(-2)
-        messages: Tensor = self.second(mean_over_senders(weighted)) + self.type_bias(mean_over_senders(weights))
+        weights = graph[..., self.skipped :] * others(x.shape[-2], x)
+        embedded = torch.relu(self.first(x)).unflatten(-1, (self.types, -1))
+        received = (embedded * weights.unsqueeze(-1)).sum(dim=-4).flatten(-2)
+        messages: Tensor = self.second(received) + self.type_bias(weights.sum(dim=-3))
         return messages

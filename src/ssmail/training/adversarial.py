@@ -52,10 +52,10 @@ class AdversarialLearner:
         self.average = deepcopy(self.policy).requires_grad_(False)
         self.log_temperature = torch.tensor(max(spec.sac.temperature, 1e-8), device=self.device).log().requires_grad_()
         self.optimizers = {
-            "actor": torch.optim.Adam(self.policy.parameters(), lr=spec.sac.actor_learning_rate),
-            "critic": torch.optim.Adam(self.critic.parameters(), lr=spec.sac.critic_learning_rate),
-            "discriminator": torch.optim.Adam(self.discriminator.parameters(), lr=spec.adversarial.learning_rate),
-            "temperature": torch.optim.Adam([self.log_temperature], lr=spec.sac.temperature_learning_rate),
+            "actor": torch.optim.Adam(self.policy.parameters(), lr=spec.sac.actor_learning_rate, fused=True),
+            "critic": torch.optim.Adam(self.critic.parameters(), lr=spec.sac.critic_learning_rate, fused=True),
+            "discriminator": torch.optim.Adam(self.discriminator.parameters(), lr=spec.adversarial.learning_rate, fused=True),
+            "temperature": torch.optim.Adam([self.log_temperature], lr=spec.sac.temperature_learning_rate, fused=True),
         }
         self.base_rates = {name: o.param_groups[0]["lr"] for name, o in self.optimizers.items()}
 
@@ -85,7 +85,7 @@ class AdversarialLearner:
     @staticmethod
     def _log(logs: dict[str, list[float]], values: dict[str, Tensor]) -> None:
         for name, value in values.items():
-            logs[name].append(float(value))
+            logs[name].append(float(value.detach()))
 
     def _pick(self, source: Batch, count: int) -> Batch:
         return source[torch.randint(len(source), (count,), generator=self.generators["data"]).to(self.device)]
@@ -104,6 +104,11 @@ class AdversarialLearner:
         states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
         return Batch(states, actions, generated.source), alpha
 
+    def _pick_steps(self, steps: int) -> Tensor:
+        """The time steps that an update uses, in random order: all of them, or training.time_steps of them."""
+        order = torch.randperm(steps, generator=self.generators["data"])
+        return order[: self.spec.training.time_steps].to(self.device)
+
     def _inputs(self, batch: Batch) -> Tensor:
         """Features of the states in which actions were taken: (B, T, N, F)."""
         return self.features(batch.states[:, :-1], batch.states[:, 0])
@@ -118,7 +123,8 @@ class AdversarialLearner:
         expert = self._pick(self.experts, b)
         mixed, alpha = self._mixed(generated)
         everything = Batch.concatenate([generated, expert, mixed])
-        outputs = self.discriminator(self._inputs(everything), everything.actions).chunk(3)
+        chosen = self._pick_steps(everything.actions.shape[1])
+        outputs = self.discriminator(self._inputs(everything)[:, chosen], everything.actions[:, chosen]).chunk(3)
         loss, terms = ssail_loss(*outputs, alpha)
         self._step("discriminator", loss, self.discriminator.parameters())
         return {"discriminator/loss": loss, **{f"discriminator/{k}": v for k, v in terms.items()}}
@@ -139,18 +145,21 @@ class AdversarialLearner:
         history = torch.cat([x, next_x[:, -1:]], dim=1)
         noise = self.policy.draw_graph_noise(b, history.shape[1], states.shape[2], self.generators["policy"])
         graphs, logits, _ = self.policy.graphs(history, noise.to(self.device))
-        graph, next_graph = graphs[:, :-1], graphs[:, 1:].detach()
+        chosen = self._pick_steps(x.shape[1])
+        graph, next_graph = graphs[:, chosen], graphs[:, chosen + 1].detach()
+        x, next_x, actions = x[:, chosen], next_x[:, chosen], actions[:, chosen]
+        states, next_states = states[:, chosen], next_states[:, chosen]
 
         with torch.no_grad():
             reward = self.spec.adversarial.reward_scale * ssail_reward(self.discriminator(x, actions))
-            next_action, next_log_prob = self.policy.actor.act(next_x, next_graph, next_states[..., a:], self._noise(actions))
+            next_action, next_log_prob = self.policy.actor.sample_with_log_prob(next_x, next_graph, next_states[..., a:], self._noise(actions))
             next_q = self.target_critic(next_x, next_action, next_graph)
             target = critic_target(reward, next_q, next_log_prob, self.temperature, self.spec.sac.gamma)
         fixed_graph = graph.detach()
         value_loss = critic_loss(self.critic(x, actions, fixed_graph), target)
         self._step("critic", value_loss, self.critic.parameters())
 
-        action, log_prob = self.policy.actor.act(x, graph, states[..., a:], self._noise(actions))
+        action, log_prob = self.policy.actor.sample_with_log_prob(x, graph, states[..., a:], self._noise(actions))
         self.critic.requires_grad_(False)
         policy_loss = actor_loss(self.critic(x, action, fixed_graph), log_prob, self.temperature)
         self.critic.requires_grad_(True)

@@ -55,7 +55,7 @@ def rollout(
         x = features(state, start, t)
         at = t if graph_noise.shape[1] > 1 else 0
         graph, _, memory = policy.graphs(x, graph_noise[:, at : at + 1], memory)
-        action, _ = policy.actor.act(x, graph, state[..., policy.action_size :], noise[t])
+        action = policy.actor.sample(x, graph, state[..., policy.action_size :], noise[t])
         states.append(state)
         actions.append(action)
         state = integrator.step(state, action)
