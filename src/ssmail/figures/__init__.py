@@ -1,1 +1,93 @@
-""""""
+"""The figures of the paper, redrawn from the store alone.
+
+Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
+Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.
+"""
+
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, cast
+
+from ssmail.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+    from ssmail.figures.provenance import Provenance
+    from ssmail.store import Store
+
+__all__ = ["FIGURES", "FigureModule", "FigureRecord", "NoRuns", "save"]
+
+
+class NoRuns(InputError):  # noqa: N818 - named for what is the case, as its siblings are
+    """The store holds no run that the figure can be drawn from; the message gives the command that produces one."""
+
+
+class FigureRecord(Protocol):
+    """What every figure's frozen record offers."""
+
+    @property
+    def provenance(self) -> "Provenance":
+        """The runs that the figure is drawn from."""
+        ...
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences for the reader: which runs were chosen, and what was left out."""
+        ...
+
+    def table(self) -> "pd.DataFrame":
+        """Exactly what is shown, one row for each point."""
+        ...
+
+
+@dataclass(frozen=True)
+class FigureModule:
+    """One figure: its name in the paper, its alias, and its module, imported at first use."""
+
+    name: str
+    alias: str
+    summary: str
+
+    @property
+    def stem(self) -> str:
+        """The name of the module and, without the ending, of the files that are saved."""
+        return f"{self.name}_{self.alias}"
+
+    def collect(self, store: "Store", runs: Sequence[str] | None = None) -> FigureRecord:
+        """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs.
+
+        Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
+        """
+        return cast(FigureRecord, self._module().collect(store, runs))
+
+    def draw(self, record: FigureRecord) -> "Figure":
+        """The record as a matplotlib Figure, one column wide."""
+        return cast("Figure", self._module().draw(record))
+
+    def _module(self) -> Any:
+        return importlib.import_module(f"{__name__}.{self.stem}")
+
+
+_MODULES = (
+    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed"),
+    FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
+    FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
+)
+
+FIGURES: dict[str, FigureModule] = {key: module for module in _MODULES for key in (module.name, module.alias)}
+
+
+def save(
+    name: str, record: FigureRecord, figure: "Figure", outdir: Path, formats: Sequence[str] = ("png",)
+) -> list[Path]:
+    """Write the figure in each of `formats` (png, pdf, svg) and the CSV of what it shows; return the paths, CSV last.
+
+    `name` is a key of FIGURES. Raises InputError for an unknown format or a folder that cannot be written.
+    """
+    from ssmail.figures.saving import save_figure
+
+    return save_figure(FIGURES[name].stem, record, figure, outdir, formats)

@@ -1,0 +1,113 @@
+"""Where a figure comes from, written into its files and read back: PNG text chunk, PDF information, SVG metadata.
+
+The record is one line of JSON under one key of each format: `ssmail` (PNG), `Keywords` (PDF), `dc:description` (SVG).
+No date is written, so that equal runs give equal files.
+"""
+
+import json
+import re
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from PIL import Image, UnidentifiedImageError
+
+from ssmail import __version__
+from ssmail.errors import InputError
+from ssmail.store import RunRow
+
+FORMATS = ("png", "pdf", "svg")
+
+_SVG_DESCRIPTION = "{http://purl.org/dc/elements/1.1/}description"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """The runs behind a figure and the code that computed and drew it. Hashes and versions are distinct and sorted."""
+
+    figure: str
+    run_ids: tuple[str, ...]  # full ids, in the order of the record
+    spec_hashes: tuple[str, ...]
+    dataset_hashes: tuple[str, ...]
+    code: tuple[str, ...]  # of the runs: package version, "+", git commit, "-dirty" if the tree was changed
+    drawn_with: str  # ssmail's version
+
+    @classmethod
+    def of(cls, figure: str, runs: Sequence[RunRow]) -> Self:
+        """The provenance of a figure drawn from these runs."""
+        return cls(
+            figure=figure,
+            run_ids=tuple(run.id for run in runs),
+            spec_hashes=_distinct(run.spec_hash for run in runs),
+            dataset_hashes=_distinct(run.dataset_hash for run in runs if run.dataset_hash),
+            code=_distinct(_code(run) for run in runs),
+            drawn_with=__version__,
+        )
+
+    def as_json(self) -> str:
+        """One line of ASCII."""
+        return json.dumps(asdict(self), separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, text: str) -> Self:
+        """The inverse of `as_json`. Raises ValueError or TypeError on other text."""
+        values: dict[str, Any] = json.loads(text)
+        lists = {key: tuple(value) for key, value in values.items() if isinstance(value, list)}
+        return cls(**{**values, **lists})
+
+    def metadata(self, format: str) -> dict[str, Any]:
+        """What to pass as `metadata` to `Figure.savefig` for one of FORMATS."""
+        title = f"ssmail {self.figure}"
+        if format == "png":
+            return {"Title": title, "ssmail": self.as_json()}
+        if format == "pdf":
+            return {"Title": title, "Keywords": self.as_json(), "CreationDate": None, "ModDate": None}
+        return {"Title": title, "Description": self.as_json(), "Date": None}
+
+
+def read(path: Path) -> Provenance:
+    """The provenance inside a PNG, PDF or SVG that ssmail saved.
+
+    Raises InputError for a file that cannot be read or that carries none.
+    """
+    readers = {".png": _png_text, ".pdf": _pdf_text, ".svg": _svg_text}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"{path} is no figure of ssmail; give a file that ends in .png, .pdf or .svg.")
+    try:
+        return Provenance.from_json(reader(path))
+    except OSError as error:
+        if isinstance(error, UnidentifiedImageError):
+            raise InputError(f"{path} is not a PNG image; draw it again with `ssmail plot`.") from None
+        raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
+    except (ValueError, TypeError, KeyError, ElementTree.ParseError):
+        raise InputError(f"{path} carries no run ids of ssmail; draw it again with `ssmail plot`.") from None
+
+
+def _distinct(values: Any) -> tuple[str, ...]:
+    return tuple(sorted(set(values)))
+
+
+def _code(run: RunRow) -> str:
+    commit = f"+{run.git_commit}" if run.git_commit else ""
+    return f"{run.package_version}{commit}{'-dirty' if run.git_dirty else ''}"
+
+
+def _png_text(path: Path) -> str:
+    with Image.open(path, formats=["PNG"]) as image:
+        return str(image.info["ssmail"])
+
+
+def _pdf_text(path: Path) -> str:
+    """The Keywords of the information dictionary, which matplotlib writes uncompressed."""
+    found = re.search(rb"/Keywords \(((?:[^\\()]|\\.)*)\)", path.read_bytes(), re.DOTALL)
+    if found is None:
+        raise ValueError("no keywords")
+    return re.sub(rb"\\(.)", rb"\1", found.group(1)).decode("ascii")
+
+
+def _svg_text(path: Path) -> str:
+    element = ElementTree.parse(path).getroot().find(f".//{_SVG_DESCRIPTION}")
+    return (element.text or "") if element is not None else ""

@@ -1,0 +1,29 @@
+"""The arrays of a tiny Y-Junction run, small enough to work out by hand."""
+
+import numpy as np
+
+STARTS, SAMPLES, STEPS, AGENTS = 3, 2, 5, 2
+
+
+def lanes() -> np.ndarray:
+    """(2, B, T, N, 2): agent n starts n + b/10 behind the leader, drives along +x, and from x = 2 on also to +-y."""
+    x = np.arange(STEPS)[None, :, None] - np.arange(AGENTS) - np.arange(STARTS)[:, None, None] / 10
+    y = np.maximum(x - 2, 0)
+    return np.stack([np.stack([x, sign * y], axis=-1) for sign in (1, -1)]).astype(np.float32)
+
+
+def arrays(shift: float = 0.0) -> dict[str, np.ndarray]:
+    """What a finished run stores. Rollout (s, b) takes lane (s + b) % 2, 0.01 (3 s + b) + shift to the left of it."""
+    modes = lanes()
+    rollouts = np.stack([[modes[(s + b) % 2, b] for b in range(STARTS)] for s in range(SAMPLES)])
+    rollouts[..., 1] += 0.01 * np.arange(SAMPLES * STARTS).reshape(SAMPLES, STARTS, 1, 1) + shift
+    x = np.arange(-2.0, 6.0)
+    centres = np.stack([np.stack([x, sign * np.maximum(x - 2, 0)], axis=-1) for sign in (1, -1)])
+    lane = np.array([1, 0, 1])
+    return {
+        "test/rollouts": rollouts.astype(np.float32),
+        "test/lanes": modes,
+        "train/expert": modes[lane, np.arange(STARTS)],
+        "train/lane": lane,
+        "lane_centres": centres.astype(np.float32),
+    }

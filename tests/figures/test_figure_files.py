@@ -1,0 +1,147 @@
+"""Saved figures: run ids in every format, equal bytes for equal runs, sentences for what cannot be done."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import pypdf
+import pytest
+from PIL import Image
+
+import ssmail
+from ssmail.errors import InputError
+from ssmail.figures import FIGURES, provenance, save
+from ssmail.store import RunState, Store
+
+NAMES = ("fig4", "fig5", "fig9")
+
+
+@pytest.fixture
+def filled(store: Store, add_run: Any) -> Store:
+    add_run(0)
+    add_run(1, [0.06, 0.03, 0.02], shift=0.1)
+    add_run(2, [0.5], RunState.DIVERGED)
+    return store
+
+
+def saved(store: Store, name: str, outdir: Path, formats: Sequence[str] = provenance.FORMATS) -> list[Path]:
+    record = FIGURES[name].collect(store)
+    return save(name, record, FIGURES[name].draw(record), outdir, formats)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_format_gives_its_provenance_back(filled: Store, tmp_path: Path, name: str) -> None:
+    expected = FIGURES[name].collect(filled).provenance
+    *images, csv = saved(filled, name, tmp_path)
+    stem = FIGURES[name].stem
+    assert [path.name for path in images] == [f"{stem}.png", f"{stem}.pdf", f"{stem}.svg"]
+    assert csv.name == f"{stem}.csv"
+    assert [provenance.read(path) for path in images] == [expected] * 3
+
+
+def test_provenance_names_runs_specs_data_and_code(filled: Store) -> None:
+    runs = filled.runs()
+    found = FIGURES["fig4"].collect(filled).provenance
+    assert found.figure == "fig4"
+    assert found.run_ids == tuple(run.id for run in runs)
+    assert found.spec_hashes == (runs[0].spec_hash,)
+    assert found.dataset_hashes == ("d" * 64,)
+    (code,) = found.code
+    assert code.startswith(ssmail.__version__)
+    assert (runs[0].git_commit or "") in code
+    assert code.endswith("-dirty") is bool(runs[0].git_dirty)
+    assert found.drawn_with == ssmail.__version__
+
+
+def test_other_readers_find_it_and_no_date(filled: Store, tmp_path: Path) -> None:
+    png, pdf, svg, _ = saved(filled, "fig4", tmp_path)
+    text = FIGURES["fig4"].collect(filled).provenance.as_json()
+    with Image.open(png) as image:
+        assert image.info["ssmail"] == text
+        assert image.size[0] == pytest.approx(3.4 * 300)
+    information = pypdf.PdfReader(pdf).metadata
+    assert information is not None
+    assert information["/Keywords"] == text
+    assert not {"/CreationDate", "/ModDate"} & set(information)
+    assert "<dc:date>" not in svg.read_text()
+
+
+@pytest.mark.parametrize("awkward", ["plain", "(brackets)", "back\\slash", 'a "quoted" <tag> & é', "line\nbreak", ")"])
+def test_any_text_survives_every_format(filled: Store, tmp_path: Path, awkward: str) -> None:
+    record = FIGURES["fig9"].collect(filled)
+    odd = provenance.Provenance("fig9", (awkward,), (), (), (awkward,), "0")
+    figure = FIGURES["fig9"].draw(record)
+    for format in provenance.FORMATS:
+        path = tmp_path / f"odd.{format}"
+        figure.savefig(path, metadata=odd.metadata(format))
+        assert provenance.read(path) == odd
+
+
+DRAW = """
+import sys
+from pathlib import Path
+from ssmail.figures import FIGURES, provenance, save
+from ssmail.store import Store
+store = Store.open(sys.argv[1])
+for name in ("fig4", "fig5", "fig9"):
+    record = FIGURES[name].collect(store)
+    save(name, record, FIGURES[name].draw(record), Path(sys.argv[2]), provenance.FORMATS)
+assert "matplotlib.pyplot" not in sys.modules, "a figure must not touch pyplot's global state"
+"""
+
+
+def test_equal_runs_give_equal_bytes_in_any_process(filled: Store, tmp_path: Path) -> None:
+    here = [path for name in NAMES for path in saved(filled, name, tmp_path / "here")]
+    environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "SOURCE_DATE_EPOCH": "1"}
+    command = [sys.executable, "-c", DRAW, filled.url, str(tmp_path / "there")]
+    subprocess.run(command, env=environment, check=True)
+    assert len(here) == 12
+    for path in here:
+        assert path.read_bytes() == (tmp_path / "there" / path.name).read_bytes(), path.name
+
+
+def test_a_changed_value_changes_every_file(filled: Store, add_run: Any, tmp_path: Path) -> None:
+    before = {path.name: path.read_bytes() for path in saved(filled, "fig4", tmp_path / "before", ["png"])}
+    add_run(1, [0.06, 0.03, 0.03])
+    after = {path.name: path.read_bytes() for path in saved(filled, "fig4", tmp_path / "after", ["png"])}
+    assert before.keys() == after.keys()
+    assert all(before[name] != after[name] for name in before)
+
+
+def test_the_users_matplotlib_settings_neither_matter_nor_change(filled: Store, tmp_path: Path) -> None:
+    plain = saved(filled, "fig4", tmp_path / "plain", ["svg"])
+    with matplotlib.rc_context({"lines.linewidth": 9.0, "font.size": 30.0, "svg.hashsalt": "mine"}):
+        mine = dict(matplotlib.rcParams)
+        odd = saved(filled, "fig4", tmp_path / "odd", ["svg"])
+        assert dict(matplotlib.rcParams) == mine
+    assert [path.read_bytes() for path in odd] == [path.read_bytes() for path in plain]
+
+
+def test_what_cannot_be_saved_is_said(filled: Store, tmp_path: Path) -> None:
+    record = FIGURES["fig9"].collect(filled)
+    figure = FIGURES["fig9"].draw(record)
+    with pytest.raises(InputError, match=r"^unknown figure format 'jpg'; choose from png, pdf, svg\.$"):
+        save("fig9", record, figure, tmp_path / "new", ["png", "jpg"])
+    assert not (tmp_path / "new").exists()
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"file cannot be written: .*; choose another folder\.$"):
+        save("fig9", record, figure, tmp_path / "file", ["png"])
+
+
+def test_what_cannot_be_read_is_said(filled: Store, tmp_path: Path) -> None:
+    figure = FIGURES["fig9"].draw(FIGURES["fig9"].collect(filled))
+    for format in provenance.FORMATS:
+        foreign, broken = tmp_path / f"foreign.{format}", tmp_path / f"broken.{format}"
+        figure.savefig(foreign)  # without metadata
+        broken.write_bytes(b"nothing of the kind")
+        for path in (foreign, broken):
+            with pytest.raises(InputError, match=f"^{path} (carries no run ids of ssmail|is not a PNG image); "):
+                provenance.read(path)
+        with pytest.raises(InputError, match="cannot be read: No such file"):
+            provenance.read(tmp_path / f"missing.{format}")
+    with pytest.raises(InputError, match=r"is no figure of ssmail; give a file that ends in \.png, \.pdf or \.svg"):
+        provenance.read(tmp_path / "figure.jpg")
