@@ -88,8 +88,8 @@ def _as_url(where: str | Path) -> URL:
         raise InputError(f"{where!r} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from error
     if url.get_backend_name() != "sqlite":
         return url
-    if url.database in (None, "", ":memory:"):
-        raise InputError(f"{where!r} is a database in memory, which is lost at once; give the path of a file")
+    if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
+        raise InputError(f"{where!r} names no file on disk that ssmail could use; give the path of a file")
     return url.set(database=str(Path(str(url.database)).absolute()))
 
 

@@ -1,0 +1,26 @@
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ssmail.experiments import build_spec
+from ssmail.spec import RunSpec
+from ssmail.store import RunWriter, Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store.open(tmp_path / "results" / "ssmail.db")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def spec() -> RunSpec:
+    return build_spec("ssail", "yjunction", "smoke")
+
+
+@pytest.fixture
+def writer(store: Store, spec: RunSpec) -> RunWriter:
+    """Of a running run with seed 0."""
+    return store.start_run(spec, 0, dataset_hash="d" * 64, device="cpu")

@@ -1,0 +1,374 @@
+"""The life of runs: begun, written, ended, resumed, given up, found again, deleted."""
+
+import dataclasses
+import math
+import sqlite3
+import subprocess
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ssmail.errors import InputError, SsmailError
+from ssmail.experiments import build_spec
+from ssmail.spec import RunSpec
+from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive, origin
+
+NOT_FINITE = {"nan": math.nan, "up": math.inf, "down": -math.inf}
+
+
+def only(store: Store) -> RunRow:
+    (row,) = store.runs()
+    return row
+
+
+def values(store: Store, run_id: str) -> dict[tuple[str, int], float]:
+    frame = store.metrics([run_id])
+    return {(name, step): value for name, step, value in zip(frame["name"], frame["step"], frame["value"], strict=True)}
+
+
+def test_a_new_run_says_what_it_is_and_where_it_is_computed(store: Store, spec: RunSpec, writer: RunWriter) -> None:
+    row = only(store)
+    assert (row.id, row.name) == (writer.run_id, writer.run_id[:8])
+    assert (row.method, row.environment, row.profile, row.seed) == ("ssail", "yjunction", "smoke", 0)
+    assert row.spec == spec.model_dump(mode="json")
+    assert (row.spec_hash, row.dataset_hash, row.device) == (spec.hash(), "d" * 64, "cpu")
+    assert (row.state, row.error, row.finished, row.resumes) == (RunState.RUNNING, None, None, 0)
+    assert abs((datetime.now(UTC) - row.started).total_seconds()) < 60
+    assert row.torch_version.startswith("2.")
+    assert row.host
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        row.seed = 1  # type: ignore[misc]
+
+
+def test_metrics_come_back_with_nan_and_infinities(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"loss": 0.5, **NOT_FINITE})
+    writer.epoch(2, {"loss": 1e-300})
+    frame = store.metrics([writer.run_id])
+    assert list(frame.columns) == ["run_id", "seed", "name", "step", "value"]
+    assert set(frame["run_id"]) == {writer.run_id}
+    assert set(frame["seed"]) == {0}
+    found = values(store, writer.run_id)
+    assert math.isnan(found.pop(("nan", 1)))
+    assert found == {("loss", 1): 0.5, ("loss", 2): 1e-300, ("up", 1): math.inf, ("down", 1): -math.inf}
+
+
+def test_the_column_kind_is_what_saves_nan(store: Store, writer: RunWriter) -> None:
+    """Negative control: SQLite itself keeps no NaN, so without `kind` it would be lost."""
+    writer.epoch(1, NOT_FINITE)
+    with sqlite3.connect(store.where) as connection:
+        assert connection.execute("SELECT ?", (math.nan,)).fetchone() == (None,)
+        rows = connection.execute("SELECT name, value, kind FROM metric ORDER BY name").fetchall()
+    connection.close()
+    assert rows == [("down", None, "-inf"), ("nan", None, "nan"), ("up", None, "inf")]
+
+
+def test_latest_metrics_and_choice_of_names(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"a": 1.0, "b": 2.0})
+    writer.epoch(2, {"a": 3.0})
+    latest = store.latest_metrics([writer.run_id])
+    assert latest.values.tolist() == [[writer.run_id, "a", 2, 3.0], [writer.run_id, "b", 1, 2.0]]
+    assert store.latest_metrics([writer.run_id], ["b"])["value"].tolist() == [2.0]
+    assert store.metrics([writer.run_id], ["a"])["value"].tolist() == [1.0, 3.0]
+
+
+def test_no_metrics_still_give_typed_columns(store: Store, writer: RunWriter) -> None:
+    for frame in (store.metrics([]), store.metrics([writer.run_id])):
+        assert frame.empty
+        assert frame.dtypes[["seed", "step", "value"]].tolist() == [np.int64, np.int64, np.float64]
+    assert store.latest_metrics([]).empty
+
+
+def test_a_step_is_recorded_once(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"a": 1.0})
+    with pytest.raises(SsmailError, match="already has metrics of step 1"):
+        writer.epoch(1, {"b": 5.0, "a": 2.0})
+    assert values(store, writer.run_id) == {("a", 1): 1.0}  # and nothing of the refused step
+
+
+WRITES: dict[str, Callable[[RunWriter], None]] = {
+    "epoch": lambda writer: writer.epoch(9, {"a": 1.0}),
+    "final": lambda writer: writer.final(9, {"a": 1.0}),
+    "heartbeat": lambda writer: writer.heartbeat(),
+    "arrays": lambda writer: writer.arrays({"x": np.zeros(1)}),
+    "artifact": lambda writer: writer.artifact("x", Path(__file__)),
+    "finish": lambda writer: writer.finish(RunState.FAILED),
+}
+
+
+@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
+@pytest.mark.parametrize("state", [RunState.FINISHED, RunState.DIVERGED, RunState.FAILED, RunState.INTERRUPTED])
+def test_a_run_that_ended_cannot_be_written(
+    store: Store, writer: RunWriter, state: RunState, write: Callable[[RunWriter], None]
+) -> None:
+    write_to_running = WRITES["epoch"]
+    write_to_running(writer)  # negative control: the very same call works while the run is running
+    writer.finish(state, "why")
+    before, recorded = only(store), values(store, writer.run_id)
+    with pytest.raises(SsmailError, match=f"is {state} and can no longer be written"):
+        write(writer)
+    assert only(store) == before
+    assert values(store, writer.run_id) == recorded
+    assert store.array_names(writer.run_id) == []
+    assert store.artifacts(writer.run_id) == []
+
+
+@pytest.mark.parametrize("state", [RunState.FINISHED, RunState.DIVERGED])
+def test_a_finished_or_diverged_run_cannot_be_resumed(store: Store, writer: RunWriter, state: RunState) -> None:
+    writer.finish(state)
+    with pytest.raises(SsmailError, match="cannot be resumed"):
+        store.resume_run(writer.run_id, 0)
+
+
+@pytest.mark.parametrize("state", [RunState.QUEUED, RunState.RUNNING])
+def test_a_run_cannot_end_in_a_state_that_is_no_end(writer: RunWriter, state: RunState) -> None:
+    with pytest.raises(SsmailError, match="cannot end"):
+        writer.finish(state)
+
+
+def test_resuming_drops_what_came_after_the_checkpoint(store: Store, writer: RunWriter) -> None:
+    for step in (1, 2, 3):
+        writer.epoch(step, {"a": step, "late": math.nan} if step == 3 else {"a": step})
+    writer.finish(RunState.INTERRUPTED, "Ctrl-C")
+    again = store.resume_run(writer.run_id, 2)
+    row = only(store)
+    assert (row.state, row.error, row.finished, row.resumes) == (RunState.RUNNING, None, None, 1)
+    assert values(store, again.run_id) == {("a", 1): 1.0, ("a", 2): 2.0}
+    assert store.latest_metrics([again.run_id]).values.tolist() == [[again.run_id, "a", 2, 2.0]]
+    again.epoch(3, {"a": 30.0})
+    assert values(store, again.run_id)[("a", 3)] == 30.0
+
+
+def test_a_checkpoint_ahead_of_the_database_is_refused(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"a": 1.0})
+    writer.finish(RunState.INTERRUPTED)
+    with pytest.raises(SsmailError, match=r"checkpoint of run .* is at epoch 2 but the database ends at 1"):
+        store.resume_run(writer.run_id, 2)
+    assert only(store).state is RunState.INTERRUPTED
+    store.resume_run(writer.run_id, 1)
+
+
+def test_a_final_evaluation_cut_short_is_replaced(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"a": 1.0})
+    writer.final(1, {"test/a": 2.0})
+    writer.finish(RunState.FAILED)
+    again = store.resume_run(writer.run_id, 1)
+    again.final(1, {"test/a": 3.0})
+    assert values(store, again.run_id) == {("a", 1): 1.0, ("test/a", 1): 3.0}
+    assert store.latest_metrics([again.run_id], ["test/a"])["value"].tolist() == [3.0]
+
+
+def test_resources_add_up_over_resumes(store: Store, writer: RunWriter) -> None:
+    deadline = time.process_time() + 0.05
+    while time.process_time() < deadline:
+        pass
+    writer.finish(RunState.INTERRUPTED)
+    first = only(store)
+    again = store.resume_run(writer.run_id, 0)
+    time.sleep(0.05)
+    again.finish(RunState.FINISHED)
+    second = only(store)
+    assert first.wall_seconds >= 0.05
+    assert first.cpu_seconds >= 0.05
+    assert second.wall_seconds >= first.wall_seconds + 0.05
+    assert second.cpu_seconds >= first.cpu_seconds
+    assert first.peak_memory_bytes is not None
+    assert second.peak_memory_bytes is not None
+    assert 2**24 < first.peak_memory_bytes <= second.peak_memory_bytes < 2**36
+    assert second.finished is not None
+    assert second.finished > second.started
+
+
+def test_who_lost_the_run_to_another_process_writes_no_more(store: Store, writer: RunWriter) -> None:
+    writer.epoch(1, {"a": 1.0})
+    again = store.resume_run(writer.run_id, 1, stale_seconds=0)  # the first process was silent and taken for dead
+    with pytest.raises(SsmailError, match="resumed by another process"):
+        writer.epoch(2, {"a": 666.0})
+    again.epoch(2, {"a": 2.0})
+    assert values(store, again.run_id) == {("a", 1): 1.0, ("a", 2): 2.0}
+
+
+def test_a_running_cell_is_refused_until_it_falls_silent(store: Store, spec: RunSpec, writer: RunWriter) -> None:
+    sentence = r"seed 0 of this spec is being computed by another process on .*; wait for it, or"
+    for attempt in (
+        lambda: store.start_run(spec, 0, dataset_hash=None, device="cpu", replace=True),
+        lambda: store.resume_run(writer.run_id, 0),
+        lambda: store.delete([writer.run_id]),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            attempt()
+    store.start_run(spec, 1, dataset_hash=None, device="cpu")  # another seed is another cell
+    store.start_run(spec, 0, dataset_hash=None, device="cpu", stale_seconds=0)
+    assert [row.state for row in store.runs() if row.seed == 0] == [RunState.INTERRUPTED, RunState.RUNNING]
+
+
+def test_a_finished_cell_is_begun_again_only_on_request(store: Store, spec: RunSpec, writer: RunWriter) -> None:
+    writer.finish(RunState.FINISHED)
+    with pytest.raises(InputError, match=f"is finished already, as run {writer.run_id[:8]}"):
+        store.start_run(spec, 0, dataset_hash=None, device="cpu")
+    second = store.start_run(spec, 0, dataset_hash=None, device="cpu", replace=True)
+    assert [row.id for row in store.runs()] == [writer.run_id, second.run_id]
+    newest = store.find_cell(spec.hash(), 0)
+    assert newest is not None
+    assert newest.id == second.run_id
+    assert store.find_cell(spec.hash(), 1) is None
+
+
+def test_silence_is_found(store: Store, writer: RunWriter) -> None:
+    assert is_alive(only(store), 30)
+    assert store.mark_stale(30) == []
+    time.sleep(0.02)
+    (found,) = store.mark_stale(0.01)
+    assert found.id == writer.run_id
+    row = only(store)
+    assert row.state is RunState.INTERRUPTED
+    assert row.error is not None
+    assert row.error.startswith("its process fell silent after 20")
+    assert not is_alive(row, 30)
+    assert store.mark_stale(0) == []  # it is interrupted already
+
+
+def test_a_heartbeat_moves_the_last_sign_of_life(store: Store, writer: RunWriter) -> None:
+    before = only(store).heartbeat
+    time.sleep(0.01)
+    writer.heartbeat()
+    assert only(store).heartbeat >= before + timedelta(seconds=0.01)
+
+
+def test_ending_a_dead_run_leaves_others_alone(store: Store, writer: RunWriter) -> None:
+    store.end_dead_run(writer.run_id, RunState.FAILED, "killed")
+    assert (only(store).state, only(store).error) == (RunState.FAILED, "killed")
+    store.end_dead_run(writer.run_id, RunState.INTERRUPTED, "later")
+    assert (only(store).state, only(store).error) == (RunState.FAILED, "killed")
+
+
+def test_filters(store: Store, spec: RunSpec) -> None:
+    other = build_spec("ssail", "yjunction", "quick")
+    ids = [
+        store.start_run(chosen, seed, dataset_hash=None, device="cpu").run_id
+        for chosen, seed in ((spec, 0), (spec, 1), (other, 0))
+    ]
+    store.end_dead_run(ids[1], RunState.FAILED, "")
+
+    def found(**conditions: Any) -> list[int]:
+        return [ids.index(row.id) for row in store.runs(**conditions)]
+
+    assert found() == [0, 1, 2]  # newest last
+    assert found(profile="quick") == [2]
+    assert found(method="ssail", environment="yjunction", profile="smoke") == [0, 1]
+    assert found(method="gail") == found(environment="mocap") == []
+    assert found(state=RunState.FAILED) == found(state="failed") == [1]
+    assert found(figure="fig4") == [0, 1, 2]
+    assert found(figure="fig4", profile="smoke", state="running") == [0]
+    assert found(ids=[ids[2], ids[0][:8].upper()]) == [0, 2]
+    assert found(ids=[]) == []
+
+
+def test_unknown_and_ambiguous_ids(store: Store, spec: RunSpec) -> None:
+    ids = [store.start_run(spec, seed, dataset_hash=None, device="cpu").run_id for seed in range(17)]
+    shared = next(digit for digit in "0123456789abcdef" if sum(run_id.startswith(digit) for run_id in ids) > 1)
+    with pytest.raises(InputError, match=f"several runs have an id that begins with '{shared}'"):
+        store.runs(ids=[shared])
+    for unknown in ("zz", "%", "_", ""):
+        with pytest.raises(InputError, match="no run has an id that begins with"):
+            store.runs(ids=[unknown])
+    with pytest.raises(InputError, match="there is no run zz"):
+        store.resume_run("zz", 0)
+
+
+def test_a_figure_keeps_only_its_methods(store: Store, spec: RunSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    store.start_run(spec, 0, dataset_hash=None, device="cpu")
+    monkeypatch.setattr("ssmail.experiments.figure_requirements", lambda name: ("yjunction", ("gail",)))
+    assert store.runs(figure="fig4") == []
+
+
+def test_artifacts(store: Store, writer: RunWriter, tmp_path: Path) -> None:
+    inside = store.checkpoint_root / writer.run_id / "best.pt"
+    inside.parent.mkdir(parents=True)
+    inside.write_bytes(b"abc")
+    outside = tmp_path / "elsewhere.bin"
+    outside.write_bytes(b"")
+    writer.artifact("outside", outside)
+    writer.artifact("best.pt", inside)
+    best, other = store.artifacts(writer.run_id)
+    assert (best.name, best.path, best.size_bytes) == ("best.pt", inside, 3)
+    assert best.sha256 == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # NIST's example
+    assert (other.name, other.path, other.size_bytes) == ("outside", outside, 0)
+
+
+def test_artifacts_move_with_the_database(store: Store, writer: RunWriter, tmp_path: Path) -> None:
+    file = store.checkpoint_root / writer.run_id / "best.pt"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"abc")
+    writer.artifact("best.pt", file)
+    store.close()
+    moved = (tmp_path / "results").rename(tmp_path / "moved")
+    again = Store.open(moved / "ssmail.db")
+    (found,) = again.artifacts(writer.run_id)
+    assert found.path == moved / "checkpoints" / writer.run_id / "best.pt"
+    assert found.path.exists()
+    again.close()
+
+
+def test_delete_removes_rows_and_checkpoints_of_those_runs_only(store: Store, spec: RunSpec) -> None:
+    writers = [store.start_run(spec, seed, dataset_hash=None, device="cpu") for seed in (0, 1)]
+    for writer in writers:
+        file = store.checkpoint_root / writer.run_id / "last.pt"
+        file.parent.mkdir(parents=True)
+        file.write_bytes(b"abc")
+        writer.epoch(1, {"a": 1.0})
+        writer.arrays({"x": np.zeros(2)})
+        writer.artifact("last.pt", file)
+        writer.finish(RunState.FINISHED)
+    gone, kept = (writer.run_id for writer in writers)
+    with pytest.raises(InputError, match="no run has an id"):
+        store.delete([gone, "zz"])
+    assert len(store.runs()) == 2
+    store.delete([gone[:12]])
+    assert only(store).id == kept
+    with sqlite3.connect(store.where) as connection:
+        for table in ("metric", "metric_latest", "array", "artifact"):
+            assert connection.execute(f"SELECT DISTINCT run_id FROM {table}").fetchall() == [(kept,)]
+    connection.close()
+    assert [path.name for path in store.checkpoint_root.iterdir()] == [kept]
+
+
+def test_the_writer_of_a_deleted_run_is_told(store: Store, writer: RunWriter) -> None:
+    store.delete([writer.run_id], stale_seconds=0)
+    with pytest.raises(SsmailError, match="was deleted"):
+        writer.epoch(1, {"a": 1.0})
+
+
+def test_the_commit_is_that_of_an_ssmail_checkout(tmp_path: Path) -> None:
+    def git(*arguments: str) -> str:
+        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false"]
+        command = ["git", "-C", str(tmp_path), *identity, *arguments]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    assert origin.git_state(tmp_path) == (None, None)
+    git("init")
+    code = tmp_path / "src" / "ssmail" / "spec.py"
+    code.parent.mkdir(parents=True)
+    code.write_text("a = 1\n")
+    (tmp_path / "experiments.yaml").write_text("")
+    (tmp_path / "cli").mkdir()
+    assert origin.git_state(tmp_path) == (None, None)  # no commit yet
+    git("add", ".")
+    git("commit", "-m", "first")
+    commit = git("rev-parse", "HEAD")
+    assert origin.git_state(tmp_path) == (commit, False)
+    (tmp_path / "notes.txt").write_text("not code")
+    assert origin.git_state(tmp_path) == (commit, False)
+    (tmp_path / "src" / "ssmail" / "new.py").write_text("")
+    assert origin.git_state(tmp_path) == (commit, True)
+
+
+def test_another_repository_around_an_installed_ssmail_is_not_its_checkout(tmp_path: Path) -> None:
+    subprocess.run(["git", "init", str(tmp_path)], check=True, capture_output=True)
+    (tmp_path / "lib" / "ssmail").mkdir(parents=True)
+    assert origin.git_state(tmp_path) == (None, None)
+    assert origin.git_state(tmp_path / "lib") == (None, None)
