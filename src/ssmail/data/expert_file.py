@@ -1,5 +1,6 @@
 """Expert sets on disk: one .npz with the arrays, the parameters and a hash of both."""
 
+import contextlib
 import json
 import os
 import zipfile
@@ -38,7 +39,8 @@ def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}; choose a writable --out") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
 
 
 def load(path: Path) -> ExpertSet:
@@ -60,9 +62,10 @@ def load(path: Path) -> ExpertSet:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(f"{path} is a single array, not an .npz of ssmail; {REMEDY}")
+        archive = np.load(path, allow_pickle=False)
+        if isinstance(archive, np.ndarray):
+            raise InputError(f"{path} is a single array, not an .npz of ssmail; {REMEDY}")
+        with archive:
             return {key: archive[key] for key in archive.files}
     except FileNotFoundError:
         raise InputError(f"there is no file {path}; make it with `ssmail generate-yjunction --out {path}`") from None

@@ -1,0 +1,64 @@
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch.distributions import AffineTransform, Independent, Normal, TanhTransform, TransformedDistribution
+
+from ssmail.models.actor import Actor
+from tests.models.test_message_passing import SPEC, one_hot_graph
+
+
+def inputs(seed: int = 0) -> tuple[Actor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    torch.manual_seed(seed)
+    actor = Actor(4, 2, SPEC)
+    for p in actor.parameters():  # away from the nearly silent start
+        p.data += 0.3 * torch.randn_like(p)
+    x, velocity, noise = torch.randn(2, 3, 5, 4), torch.randn(2, 3, 5, 2), torch.randn(2, 3, 5, 2)
+    return actor, x, one_hot_graph(2, 3, 5), velocity, noise
+
+
+@given(seed=st.integers(0, 1000))
+def test_log_probability_against_torch_distributions(seed: int) -> None:
+    actor, x, graph, velocity, noise = inputs(seed)
+    action, log_prob = actor.sample_with_log_prob(x, graph, velocity, 0.5 * noise)
+    mean, log_std = actor.distribution(x, graph)
+    inner = SPEC.action_bound - SPEC.action_step
+    transforms = [TanhTransform(cache_size=1), AffineTransform(velocity.clamp(-inner, inner), SPEC.action_step)]
+    reference = TransformedDistribution(Normal(mean, log_std.exp()), transforms)
+    u = mean + log_std.exp() * 0.5 * noise
+    expected = Independent(Normal(mean, log_std.exp()), 1).log_prob(u) - sum(
+        t.log_abs_det_jacobian(v, w).sum(-1)
+        for t, v, w in ((transforms[0], u, torch.tanh(u)), (transforms[1], torch.tanh(u), action))
+    )
+    torch.testing.assert_close(log_prob, expected, rtol=1e-4, atol=1e-4)
+    assert reference.sample().shape == action.shape
+    unsquashed = Independent(Normal(mean, log_std.exp()), 1).log_prob(u)  # negative control: the Jacobian matters
+    assert (log_prob - unsquashed).abs().min() > 0.1
+
+
+def test_density_integrates_to_one() -> None:
+    """One axis of one agent, by quadrature over the action's range."""
+    mean, std, step = torch.tensor(0.4), torch.tensor(0.7), SPEC.action_step
+    a = torch.linspace(-step, step, 20_001, dtype=torch.float64)[1:-1]
+    u = torch.atanh(a / step)
+    log_density = Normal(mean.double(), std.double()).log_prob(u) - torch.log(step * (1 - (a / step) ** 2))
+    assert abs(float(torch.trapezoid(log_density.exp(), a)) - 1) < 1e-3
+
+
+def test_actions_stay_within_step_and_bound() -> None:
+    actor, x, graph, velocity, noise = inputs()
+    action = actor.sample(100 * x, graph, 5 * velocity, 10 * noise)
+    assert bool((action.abs() <= SPEC.action_bound + 1e-6).all())
+    calm = actor.sample(x, graph, velocity.clamp(-1, 1), noise)
+    assert bool(((calm - velocity.clamp(-1, 1)).abs() <= SPEC.action_step + 1e-6).all())
+
+
+def test_sampling_with_and_without_log_prob_agree() -> None:
+    actor, x, graph, velocity, noise = inputs()
+    torch.testing.assert_close(actor.sample(x, graph, velocity, noise), actor.sample_with_log_prob(x, graph, velocity, noise)[0])
+
+
+def test_the_untrained_policy_drives_nearly_straight_on() -> None:
+    torch.manual_seed(0)
+    actor, velocity = Actor(4, 2, SPEC), torch.rand(4, 1, 3, 2)
+    action = actor.sample(torch.rand(4, 1, 3, 4), one_hot_graph(4, 1, 3), velocity, torch.zeros(4, 1, 3, 2))
+    assert float((action - velocity).abs().max()) < 0.1 * SPEC.action_step

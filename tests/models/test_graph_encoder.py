@@ -1,0 +1,70 @@
+import math
+
+import pytest
+import torch
+
+from ssmail.models.graph_encoder import GraphEncoder, GraphNoise, graph_entropy, sample_graph
+
+
+def test_a_step_sees_the_past_only() -> None:
+    torch.manual_seed(0)
+    encoder, x = GraphEncoder(4, 6, 2), torch.randn(2, 7, 3, 4)
+    later = x.clone()
+    later[:, 4:] += 1
+    logits, changed = encoder(x)[0], encoder(later)[0]
+    torch.testing.assert_close(logits[:, :4], changed[:, :4])
+    assert not torch.allclose(logits[:, 4:], changed[:, 4:])
+
+
+def test_step_by_step_equals_the_whole_sequence() -> None:
+    torch.manual_seed(0)
+    encoder, x = GraphEncoder(4, 6, 2), torch.randn(2, 7, 3, 4)
+    memory, steps = None, []
+    for t in range(7):
+        logits, memory = encoder(x[:, t : t + 1], memory)
+        steps.append(logits)
+    torch.testing.assert_close(torch.cat(steps, dim=1), encoder(x)[0])
+    forgetful = torch.cat([encoder(x[:, t : t + 1])[0] for t in range(7)], dim=1)  # negative control
+    assert not torch.allclose(forgetful, encoder(x)[0])
+
+
+@pytest.mark.parametrize("shared", ["shared", "edge"])
+@pytest.mark.parametrize("resample", ["trajectory", "step"])
+def test_sampled_edge_types_have_the_softmax_as_marginal(shared: str, resample: str) -> None:
+    """However the noise is shared, every edge at every step has each type with its softmax probability (0.015 = 3.3 sigma)."""
+    logits = torch.randn(1, 4, 3, 3, 2, generator=torch.Generator().manual_seed(1)).expand(10_000, -1, -1, -1, -1)
+    noise = GraphNoise(shared, resample).draw(10_000, 4, 3, 2, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    frequency = sample_graph(logits, noise, 0.5).mean(dim=0)
+    torch.testing.assert_close(frequency, torch.softmax(logits[0], dim=-1), atol=0.02, rtol=0)
+
+
+def test_shared_noise_makes_the_group_commit() -> None:
+    """With equal logits all edges and steps of a trajectory take one type under shared noise, and rarely do under fresh noise."""
+    logits = torch.zeros(500, 6, 3, 3, 2)
+
+    def agreement(shared: str, resample: str) -> float:
+        noise = GraphNoise(shared, resample).draw(500, 6, 3, 2, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+        kinds = sample_graph(logits, noise, 0.5).argmax(-1).flatten(1)
+        return float((kinds == kinds[:, :1]).all(dim=1).float().mean())
+
+    assert agreement("shared", "trajectory") == 1
+    assert agreement("edge", "step") < 0.01
+
+
+def test_the_sample_is_one_hot_and_its_gradient_soft() -> None:
+    logits = torch.randn(5, 2, requires_grad=True)
+    graph = sample_graph(logits, torch.zeros(5, 2), 0.7)
+    assert set(graph.detach().round(decimals=6).flatten().tolist()) == {0.0, 1.0}
+    weights = torch.randn(5, 2)
+    (graph * weights).sum().backward()
+    soft = logits.detach().clone().requires_grad_()
+    (torch.softmax(soft / 0.7, -1) * weights).sum().backward()
+    torch.testing.assert_close(logits.grad, soft.grad)
+
+
+def test_graph_entropy() -> None:
+    assert float(graph_entropy(torch.zeros(2, 3, 4))) == pytest.approx(math.log(4))
+    assert float(graph_entropy(torch.tensor([[50.0, 0.0]]))) == pytest.approx(0, abs=1e-6)
+    p = 0.2
+    logits = torch.tensor([math.log(p), math.log(1 - p)])
+    assert float(graph_entropy(logits)) == pytest.approx(-p * math.log(p) - (1 - p) * math.log(1 - p))

@@ -1,0 +1,125 @@
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from ssmail.models.actor import Actor
+from ssmail.models.critic import TwinCritic
+from ssmail.models.discriminator import Discriminator
+from ssmail.models.graph_encoder import GraphEncoder, off_diagonal, on_diagonal
+from ssmail.models.message_passing import EdgeFunction, TypedMessages
+from ssmail.spec import ModelSpec
+
+SPEC = ModelSpec(
+    hidden=8,
+    encoder_hidden=6,
+    edge_types=3,
+    first_type_is_none=True,
+    graph_temperature=0.5,
+    graph_noise="shared",
+    graph_resample="trajectory",
+    time_input=False,
+    start_input=False,
+    action_step=0.3,
+    action_bound=1.5,
+    log_std_min=-5.0,
+    log_std_max=0.0,
+)
+
+sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 5), st.integers(1, 6))  # B, T, N, D
+
+
+def one_hot_graph(b: int, t: int, n: int, k: int = 3) -> Tensor:
+    return torch.nn.functional.one_hot(torch.randint(k, (b, t, n, n)), k).float()
+
+
+@settings(max_examples=30)
+@given(size=sizes, seed=st.integers(0, 2**16))
+def test_networks_are_equivariant_to_the_order_of_agents(size: tuple[int, int, int, int], seed: int) -> None:
+    """Renaming the agents renames the outputs, and changes nothing else; shapes hold for any B, T, N, D."""
+    torch.manual_seed(seed)
+    b, t, n, d = size
+    x, action, graph = torch.randn(b, t, n, d), torch.randn(b, t, n, 2), one_hot_graph(b, t, n)
+    order = torch.randperm(n)
+    moved, moved_action, moved_graph = x[:, :, order], action[:, :, order], graph[:, :, order][:, :, :, order]
+
+    actor, critic = Actor(d, 2, SPEC), TwinCritic(d + 2, 8, 3, True)
+    discriminator, encoder = Discriminator(d + 2, 8), GraphEncoder(d, 6, 3)
+    for out, moved_out in zip(actor.distribution(x, graph), actor.distribution(moved, moved_graph), strict=True):
+        assert out.shape == (b, t, n, 2)
+        torch.testing.assert_close(out[:, :, order], moved_out)
+    assert critic(x, action, graph).shape == (b, t, n, 2)
+    torch.testing.assert_close(critic(x, action, graph)[:, :, order], critic(moved, moved_action, moved_graph))
+    assert discriminator(x, action).shape == (b, t, n)
+    torch.testing.assert_close(discriminator(x, action)[:, :, order], discriminator(moved, moved_action))
+    if n > 1:
+        logits = encoder(x)[0]
+        assert logits.shape == (b, t, n, n, 3)
+        torch.testing.assert_close(logits[:, :, order][:, :, :, order], encoder(moved)[0])
+
+
+def test_equivariance_can_fail() -> None:
+    """Negative control: a graph that is not renamed along with the agents gives other actions."""
+    torch.manual_seed(0)
+    x, graph, order = torch.randn(2, 3, 4, 5), one_hot_graph(2, 3, 4), torch.tensor([1, 2, 3, 0])
+    actor = Actor(5, 2, SPEC)
+    with pytest.raises(AssertionError):
+        torch.testing.assert_close(actor.distribution(x, graph)[0][:, :, order], actor.distribution(x[:, :, order], graph)[0])
+
+
+@settings(max_examples=20)
+@given(n=st.integers(2, 5), seed=st.integers(0, 2**16))
+def test_no_message_flows_along_an_edge_of_type_none(n: int, seed: int) -> None:
+    """With every edge of type none, an agent's action and value depend on itself only; with another type they do not."""
+    torch.manual_seed(seed)
+    x, disturbed = torch.randn(1, 1, n, 4), torch.randn(1, 1, n, 4)
+    disturbed[:, :, 0] = x[:, :, 0]
+    actor, critic = Actor(4, 2, SPEC), TwinCritic(4, 8, 3, True)
+
+    def outputs(inputs: Tensor, edge_type: int) -> Tensor:
+        graph = torch.zeros(1, 1, n, n, 3)
+        graph[..., edge_type] = 1
+        parts = [*actor.distribution(inputs, graph), critic(inputs[..., :2], inputs[..., 2:], graph)]
+        return torch.cat(parts, dim=-1)[:, :, 0]
+
+    torch.testing.assert_close(outputs(x, 0), outputs(disturbed, 0), rtol=0, atol=0)
+    assert not torch.allclose(outputs(x, 1), outputs(disturbed, 1))
+
+
+def test_typed_messages_against_the_formula() -> None:
+    """sum_i sum_k z_ijk f_k([x_i, x_j]) / (N - 1), edge by edge, self-edges left out."""
+    torch.manual_seed(0)
+    n, k, h = 4, 2, 5
+    layer = TypedMessages(3, h, k, first_is_none=False)
+    x, graph = torch.randn(n, 3), torch.rand(n, n, k)
+    expected = torch.zeros(n, h)
+    for i in range(n):
+        for j in range(n):
+            first = layer.first.sender(x[i]) + layer.first.receiver(x[j])
+            for kind in range(k):
+                part = slice(kind * h, (kind + 1) * h)
+                message = layer.second.weight[:, part] @ torch.relu(first[part]) + layer.type_bias.weight[:, kind]
+                expected[j] += (i != j) * graph[i, j, kind] * message / (n - 1)
+    torch.testing.assert_close(layer(x, graph), expected)
+
+
+def test_edge_function_equals_the_gathered_form() -> None:
+    """Per-node first layers and the mean before the second layer equal W [x_i, x_j] on gathered pairs, averaged over senders."""
+    torch.manual_seed(0)
+    layer, x = EdgeFunction(3, 6, 5), torch.randn(2, 4, 3)
+    joint = torch.cat([layer.first.sender.weight, layer.first.receiver.weight], dim=1)
+    pairs = torch.stack([torch.stack([torch.cat([x[:, i], x[:, j]], -1) for j in range(4)], 1) for i in range(4)], 1)
+    edges = layer.second(torch.relu(pairs @ joint.T + layer.first.receiver.bias))
+    torch.testing.assert_close(layer(x), edges)
+    off = edges * (1 - torch.eye(4)).view(1, 4, 4, 1)
+    torch.testing.assert_close(layer.messages(x), off.sum(1) / 3)
+
+
+@given(n=st.integers(2, 6), h=st.integers(1, 3))
+def test_off_diagonal_and_back(n: int, h: int) -> None:
+    pairs = torch.randn(2, 3, n, n, h)
+    edges = off_diagonal(pairs)
+    expected = torch.stack([pairs[:, :, i, j] for i in range(n) for j in range(n) if i != j], dim=2)
+    torch.testing.assert_close(edges, expected, rtol=0, atol=0)
+    torch.testing.assert_close(on_diagonal(edges, n), pairs * (1 - torch.eye(n)).view(n, n, 1), rtol=0, atol=0)
