@@ -16,6 +16,8 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
+Pairing = Literal["start", "nearest", "assignment"]
+
 METHODS = ("ssail",)
 ENVIRONMENTS = ("yjunction",)
 
@@ -27,7 +29,9 @@ class Frozen(BaseModel):
 
 
 class YJunctionSpec(Frozen):
-    """Geometry and size of the Y-Junction expert set (section 4.1 and B.2). Lengths are in units of the approach speed times one step."""
+    """Geometry and size of the Y-Junction expert set (section 4.1 and B.2). Lengths are in units of the approach speed
+    times one step.
+    """
 
     train: Count  # trajectories
     validation: Count
@@ -69,10 +73,12 @@ class AdversarialSpec(Frozen):
 
     alpha_low: Finite
     alpha_high: Finite
-    pairing: Literal["start", "nearest"]  # which expert trajectory a generated one is mixed with
+    pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
     learning_rate: Positive
     updates: Count  # discriminator steps for each SAC step
-    past_share: Fraction  # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
+    past_share: (
+        Fraction  # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
+    )
     reward_scale: Positive
 
     @model_validator(mode="after")
@@ -94,6 +100,7 @@ class SacSpec(Frozen):
     temperature_learning_rate: Positive
     target_entropy: Finite  # nats for each action dimension of one agent, in scaled velocity units
     graph_entropy: NonNegative  # weight of the edge-type distribution's entropy in the actor's objective
+    pairing: Pairing  # which expert trajectory a generated one is mixed with, in the actor-critic's batches
     mixed_share: Fraction  # share of tau_alpha in a SAC batch; the rest is tau_G
 
 
@@ -110,12 +117,16 @@ class TrainingSpec(Frozen):
     epochs: Count
     updates: Count  # SAC steps in each epoch
     batch: Count  # trajectories in a batch
-    time_steps: Count  # random time steps of each trajectory that an update uses (only the encoder needs whole sequences)
+    time_steps: (
+        Count  # random time steps of each trajectory that an update uses (only the encoder needs whole sequences)
+    )
     rollouts: Count  # trajectories generated in each epoch
     replay: Count  # generated trajectories kept
     learning_rate_final: Fraction  # the last epoch's learning rates, as a fraction of the first's (linear decay)
     decay_start: Fraction  # fraction of the epochs after which the decay begins
-    policy_average: Annotated[float, Field(ge=0, lt=1)]  # decay of the averaged actor that is evaluated; 0 evaluates the actor itself
+    policy_average: Annotated[
+        float, Field(ge=0, lt=1)
+    ]  # decay of the averaged actor that is evaluated; 0 evaluates the actor itself
     gradient_clip: Positive
 
 
@@ -150,5 +161,5 @@ class RunSpec(Frozen):
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:
-        """Validate plain nested values. Raises pydantic.ValidationError; ssmail.experiments turns it into a sentence."""
+        """Validate plain nested values. Raises pydantic.ValidationError, for ssmail.experiments to explain."""
         return cls.model_validate(values)

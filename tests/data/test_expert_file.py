@@ -49,7 +49,7 @@ def test_truncated_file(saved: Path, cut: float) -> None:
     whole = saved.read_bytes()
     broken = saved.with_name("broken.npz")
     broken.write_bytes(whole[: int(cut * len(whole))])
-    with pytest.raises(InputError, match="broken.npz is truncated or not an .npz"):
+    with pytest.raises(InputError, match=r"broken\.npz is truncated or not an \.npz"):
         expert_file.load(broken)
 
 
@@ -58,7 +58,7 @@ def test_truncated_file(saved: Path, cut: float) -> None:
 def test_junk(tmp_path: Path, junk: bytes) -> None:
     path = tmp_path / "junk.npz"
     path.write_bytes(junk)
-    with pytest.raises(InputError, match="junk.npz"):
+    with pytest.raises(InputError, match=r"junk\.npz"):
         expert_file.load(path)
 
 

@@ -9,7 +9,16 @@ from ssmail.spec import YJunctionSpec
 
 
 def params(**changes: object) -> YJunctionSpec:
-    values = {"train": 20, "validation": 10, "test": 10, "agents": 3, "steps": 50, "lane_angle": 43.0, "jitter": 1.0, "seed": 0}
+    values = {
+        "train": 20,
+        "validation": 10,
+        "test": 10,
+        "agents": 3,
+        "steps": 50,
+        "lane_angle": 43.0,
+        "jitter": 1.0,
+        "seed": 0,
+    }
     return YJunctionSpec.model_validate(values | changes)
 
 
@@ -31,7 +40,9 @@ def test_the_expert_follows_one_lane_and_its_dynamics(p: YJunctionSpec) -> None:
     np.testing.assert_allclose(np.diff(experts.positions, axis=1), experts.velocities[:, 1:], atol=1e-12)
     chosen = experts.continuations[experts.mode, np.arange(p.train)]
     np.testing.assert_array_equal(chosen, experts.positions)
-    np.testing.assert_array_equal(experts.continuations[0, :, 0], experts.continuations[1, :, 0])  # same start, either lane
+    np.testing.assert_array_equal(
+        experts.continuations[0, :, 0], experts.continuations[1, :, 0]
+    )  # same start, either lane
     fork = yjunction.FORK * p.steps
     assert (experts.positions[:, -1, :, 0] > fork).all(), "every agent passes the fork"
     side = np.where(experts.mode == 0, 1, -1)[:, None]
@@ -47,7 +58,9 @@ def test_agents_stay_in_single_file(p: YJunctionSpec) -> None:
 
 
 def test_the_first_state_tells_the_whole_start() -> None:
-    """Speed and lateral offset of every agent can be read off the first state, so the continuation is a function of it."""
+    """Speed and lateral offset of every agent can be read off the first state, so the continuation is a function of
+    it.
+    """
     experts = yjunction.generate(params()).train
     travelled = experts.positions[:, 10] - experts.positions[:, 0]  # still on the street
     np.testing.assert_allclose(travelled, 10 * experts.velocities[:, 0], atol=1e-9)

@@ -33,7 +33,9 @@ def test_a_mix_of_trajectories_is_a_trajectory(alpha: float, seed: int) -> None:
 
 
 def test_the_expert_obeys_the_dynamics() -> None:
-    experts = generate(YJunctionSpec(train=5, validation=1, test=1, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0))
+    experts = generate(
+        YJunctionSpec(train=5, validation=1, test=1, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
+    )
     s = experts.scaling
     positions, velocities = (torch.as_tensor(x) for x in (experts.train.positions, experts.train.velocities))
     states = torch.cat([s.scale_positions(positions), s.scale_velocities(velocities)], dim=-1)

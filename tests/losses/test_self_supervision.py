@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.losses.adversarial import ssail_loss
-from ssmail.losses.self_supervision import mix, nearest, sample_alpha
+from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.discriminator import Discriminator
 
 GENERATED, EXPERT = torch.zeros(1, 1, 1, 1), torch.ones(1, 1, 1, 1)  # (B, T, N, D)
@@ -28,12 +28,16 @@ def test_identity_is_the_exact_minimiser() -> None:
 
     assert float(loss_of(identity, alpha)) == pytest.approx(0, abs=1e-12)
     assert float(loss_of(lambda x: identity(x) + 0.1, alpha)) == pytest.approx(0.03, rel=1e-5)
-    assert float(loss_of(identity, alpha, printed_formula=True)) > 1, "negative control: the printed mix contradicts the labels"
+    assert float(loss_of(identity, alpha, printed_formula=True)) > 1, (
+        "negative control: the printed mix contradicts the labels"
+    )
 
 
 @pytest.mark.parametrize("printed_formula", [False, True])
 def test_the_network_learns_the_field(printed_formula: bool) -> None:
-    """The trained network equals the label function within 0.05 along the line, 0 and 1 at the ends; with the printed formula it does not."""
+    """The trained network equals the label function within 0.05 along the line, 0 and 1 at the ends; with the printed
+    formula it does not.
+    """
     torch.manual_seed(0)
     network = Discriminator(2, 32)
     optimizer = torch.optim.Adam(network.parameters(), lr=5e-3)
@@ -81,3 +85,18 @@ def test_terms_of_the_loss() -> None:
     loss, terms = ssail_loss(*outputs, torch.tensor([-1.0, 0.5]))
     assert {k: float(v) for k, v in terms.items()} == {"generated": 0.25, "expert": 0.5625, "self_supervised": 0.625}
     assert float(loss) == 0.25 + 0.5625 + 0.625
+
+
+def test_assignment_spreads_over_the_modes() -> None:
+    """Four trajectories near mode 0, experts half in each mode: nearest pairs all with mode 0, assignment two with
+    each.
+    """
+    experts = torch.stack([torch.full((5, 3, 4), v) for v in (0.0, 1.0, 0.0, 1.0)])
+    generated = torch.stack([torch.full((5, 3, 4), v) for v in (-0.1, 0.0, 0.3, 0.2)])
+    assert experts[nearest(generated, experts)].mean() == 0
+    order = assignment(generated, experts)
+    assert sorted(order.tolist()) == [0, 1, 2, 3]
+    assert experts[order][:, 0, 0, 0].tolist() == [0, 0, 1, 1]
+    balanced = torch.stack([torch.full((5, 3, 4), v) for v in (0.9, 0.1, 1.2, -0.2)])
+    assert experts[assignment(balanced, experts)][:, 0, 0, 0].tolist() == [1, 0, 1, 0]
+    assert sorted(assignment(torch.full((4, 5, 3, 4), torch.nan), experts).tolist()) == [0, 1, 2, 3]

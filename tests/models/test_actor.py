@@ -54,7 +54,9 @@ def test_actions_stay_within_step_and_bound() -> None:
 
 def test_sampling_with_and_without_log_prob_agree() -> None:
     actor, x, graph, velocity, noise = inputs()
-    torch.testing.assert_close(actor.sample(x, graph, velocity, noise), actor.sample_with_log_prob(x, graph, velocity, noise)[0])
+    torch.testing.assert_close(
+        actor.sample(x, graph, velocity, noise), actor.sample_with_log_prob(x, graph, velocity, noise)[0]
+    )
 
 
 def test_the_untrained_policy_drives_nearly_straight_on() -> None:

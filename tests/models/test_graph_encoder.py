@@ -31,19 +31,25 @@ def test_step_by_step_equals_the_whole_sequence() -> None:
 @pytest.mark.parametrize("shared", ["shared", "edge"])
 @pytest.mark.parametrize("resample", ["trajectory", "step"])
 def test_sampled_edge_types_have_the_softmax_as_marginal(shared: str, resample: str) -> None:
-    """However the noise is shared, every edge at every step has each type with its softmax probability (0.015 = 3.3 sigma)."""
+    """However the noise is shared, every edge at every step has each type with its softmax probability (0.015 = 3.3
+    sigma).
+    """
     logits = torch.randn(1, 4, 3, 3, 2, generator=torch.Generator().manual_seed(1)).expand(10_000, -1, -1, -1, -1)
-    noise = GraphNoise(shared, resample).draw(10_000, 4, 3, 2, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+    # type: ignore[arg-type]
+    noise = GraphNoise(shared, resample).draw(10_000, 4, 3, 2, torch.Generator().manual_seed(0))
     frequency = sample_graph(logits, noise, 0.5).mean(dim=0)
     torch.testing.assert_close(frequency, torch.softmax(logits[0], dim=-1), atol=0.02, rtol=0)
 
 
 def test_shared_noise_makes_the_group_commit() -> None:
-    """With equal logits all edges and steps of a trajectory take one type under shared noise, and rarely do under fresh noise."""
+    """With equal logits all edges and steps of a trajectory take one type under shared noise, and rarely do under
+    fresh noise.
+    """
     logits = torch.zeros(500, 6, 3, 3, 2)
 
     def agreement(shared: str, resample: str) -> float:
-        noise = GraphNoise(shared, resample).draw(500, 6, 3, 2, torch.Generator().manual_seed(0))  # type: ignore[arg-type]
+        # type: ignore[arg-type]
+        noise = GraphNoise(shared, resample).draw(500, 6, 3, 2, torch.Generator().manual_seed(0))
         kinds = sample_graph(logits, noise, 0.5).argmax(-1).flatten(1)
         return float((kinds == kinds[:, :1]).all(dim=1).float().mean())
 

@@ -65,13 +65,15 @@ def test_equivariance_can_fail() -> None:
     x, graph, order = torch.randn(2, 3, 4, 5), one_hot_graph(2, 3, 4), torch.tensor([1, 2, 3, 0])
     actor = Actor(5, 2, SPEC)
     with pytest.raises(AssertionError):
-        torch.testing.assert_close(actor.distribution(x, graph)[0][:, :, order], actor.distribution(x[:, :, order], graph)[0])
+        torch.testing.assert_close(
+            actor.distribution(x, graph)[0][:, :, order], actor.distribution(x[:, :, order], graph)[0]
+        )
 
 
 @settings(max_examples=20)
 @given(n=st.integers(2, 5), seed=st.integers(0, 2**16))
 def test_no_message_flows_along_an_edge_of_type_none(n: int, seed: int) -> None:
-    """With every edge of type none, an agent's action and value depend on itself only; with another type they do not."""
+    """With every edge of type none, an agent's action and value depend on itself only; with another they do not."""
     torch.manual_seed(seed)
     x, disturbed = torch.randn(1, 1, n, 4), torch.randn(1, 1, n, 4)
     disturbed[:, :, 0] = x[:, :, 0]
@@ -105,7 +107,9 @@ def test_typed_messages_against_the_formula() -> None:
 
 
 def test_edge_function_equals_the_gathered_form() -> None:
-    """Per-node first layers and the mean before the second layer equal W [x_i, x_j] on gathered pairs, averaged over senders."""
+    """Per-node first layers and the mean before the second layer equal W [x_i, x_j] on gathered pairs, averaged over
+    senders.
+    """
     torch.manual_seed(0)
     layer, x = EdgeFunction(3, 6, 5), torch.randn(2, 4, 3)
     joint = torch.cat([layer.first.sender.weight, layer.first.receiver.weight], dim=1)

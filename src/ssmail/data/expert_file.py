@@ -20,7 +20,9 @@ REMEDY = "generate it again with `ssmail generate-yjunction --force`"
 
 
 def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
-    """Write an expert set, atomically. Raises InputError when the file exists and `force` is off, or cannot be written."""
+    """Write an expert set, atomically. Raises InputError when the file exists and `force` is off, or cannot be
+    written.
+    """
     if path.exists() and not force:
         raise InputError(f"{path} exists already; choose another --out or overwrite it with --force")
     arrays = {f"{split}/{field}": getattr(getattr(experts, split), field) for split in SPLITS for field in FIELDS}
@@ -44,9 +46,15 @@ def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
 
 
 def load(path: Path) -> ExpertSet:
-    """Read an expert set and check it: keys, shapes, finite values, hash. Raises InputError naming the file and the fault."""
+    """Read an expert set and check it: keys, shapes, finite values, hash. Raises InputError naming the file and the
+    fault.
+    """
     contents = _read(path)
-    missing = [k for k in ("parameters", "hash", "centre_lines", *(f"{s}/{f}" for s in SPLITS for f in FIELDS)) if k not in contents]
+    missing = [
+        k
+        for k in ("parameters", "hash", "centre_lines", *(f"{s}/{f}" for s in SPLITS for f in FIELDS))
+        if k not in contents
+    ]
     if missing:
         raise InputError(f"{path} holds no array {missing[0]!r}, so it is not an expert set of ssmail; {REMEDY}")
     try:

@@ -27,7 +27,7 @@ class Trajectories:
     continuations: Floats
 
     def __len__(self) -> int:
-        return self.positions.shape[0]
+        return len(self.positions)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,10 @@
 """The Y-Junction expert (sections 4.1, B.2): agents in single file on a street along +x that splits into two lanes.
 
-Lengths are in units of the mean approach speed times one step, so that an agent covers about one unit a step. The street's centre line
-is y = 0 up to the fork; each lane leaves it on a circular arc and goes on straight at `lane_angle` to either side. A trajectory is a
-pure function of its start (position along the street, gaps, speed, lateral offsets) and of its lane, and the first state
-shows all of the start: that is what lets the metrics continue one start into either lane.
+Lengths are in units of the mean approach speed times one step, so that an agent covers about one unit a step. The
+street's centre line is y = 0 up to the fork; each lane leaves it on a circular arc and goes on straight at `lane_angle`
+to either side. A trajectory is a pure function of its start (position along the street, gaps, speed, lateral offsets)
+and of its lane, and the first state shows all of the start: that is what lets the metrics continue one start into
+either lane.
 """
 
 import hashlib
@@ -43,7 +44,9 @@ def make_expert_set(splits: dict[str, Trajectories], centre_lines: Floats, param
     """Bundle the splits with their parameters and the hash of both."""
     parameters = params.model_dump(mode="json")
     digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode())
-    arrays = [a for s in SPLITS for a in (splits[s].positions, splits[s].velocities, splits[s].mode, splits[s].continuations)]
+    arrays = [
+        a for s in SPLITS for a in (splits[s].positions, splits[s].velocities, splits[s].mode, splits[s].continuations)
+    ]
     for array in (*arrays, centre_lines):
         digest.update(np.ascontiguousarray(array).tobytes())
     return ExpertSet(**splits, centre_lines=centre_lines, parameters=parameters, hash=digest.hexdigest())

@@ -1,8 +1,8 @@
 """The trajectory environment: an action is the next velocity, and the position follows it.
 
-In raw units v[t+1] = a[t] and p[t+1] = p[t] + a[t]. This map is affine in (s, a), so any mix (1 - alpha) * tau_G + alpha * tau_E of
-two trajectories is itself a trajectory of the environment, which is why tau_alpha can feed an off-policy critic (paper, section 3.1.2).
-A non-linear environment would not have this property.
+In raw units v[t+1] = a[t] and p[t+1] = p[t] + a[t]. This map is affine in (s, a), so any mix (1 - alpha) * tau_G +
+alpha * tau_E of two trajectories is itself a trajectory of the environment, which is why tau_alpha can feed an off-
+policy critic (paper, section 3.1.2). A non-linear environment would not have this property.
 """
 
 from dataclasses import dataclass

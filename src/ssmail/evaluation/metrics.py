@@ -1,4 +1,6 @@
-"""Metrics of predicted trajectories. Positions are (B, T, N, P) arrays over the predicted steps only (the given start is left out)."""
+"""Metrics of predicted trajectories. Positions are (B, T, N, P) arrays over the predicted steps only (the given start
+is left out).
+"""
 
 import numpy as np
 
@@ -9,7 +11,9 @@ DIVERGED = 10.0  # |scaled position|
 
 
 def mode_errors(predicted: Floats, continuations: Floats) -> Floats:
-    """(L, B) mean squared position error of each trajectory to each mode, the whole group in one mode; continuations (L, B, T, N, P)."""
+    """(L, B) mean squared position error of each trajectory to each mode, the whole group in one mode; continuations
+    (L, B, T, N, P).
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         errors: Floats = np.square(continuations - predicted[None]).mean(axis=(2, 3, 4))
     return errors
@@ -22,7 +26,9 @@ def mode_mse(predicted: Floats, continuations: Floats) -> float:
 
 def nearest_mode(predicted: Floats, continuations: Floats) -> Integers:
     """(B,) index of the mode that each trajectory follows most closely."""
-    return np.argmin(np.nan_to_num(mode_errors(predicted, continuations), nan=np.inf), axis=0)
+    errors = np.nan_to_num(mode_errors(predicted, continuations), nan=np.inf)
+    modes: Integers = errors.argmin(axis=0)
+    return modes
 
 
 def lane_balance(predicted: Floats, continuations: Floats) -> float:
@@ -32,10 +38,11 @@ def lane_balance(predicted: Floats, continuations: Floats) -> float:
 
 
 def on_lane(predicted: Floats, continuations: Floats, centre_lines: Floats) -> float:
-    """Share of agents whose final position is, sideways, within 15 % of the final lane separation of a lane's centre line.
+    """Share of agents whose final position is, sideways, within 15 % of the final lane separation of a lane's centre
+    line.
 
-    The separation is the distance between the agent's final positions in the two modes; a centre line (L, P', 2) goes on
-    straight after its last point, so being early or late is not counted sideways.
+    The separation is the distance between the agent's final positions in the two modes; a centre line (L, P', 2) goes
+    on straight after its last point, so being early or late is not counted sideways.
     """
     final = predicted[:, -1]  # (B, N, 2)
     separation = np.linalg.norm(continuations[0, :, -1] - continuations[1, :, -1], axis=-1)
@@ -64,7 +71,9 @@ def lag(predicted: Floats, continuations: Floats) -> float:
 
 
 def displacement_errors(samples: Floats, expert: Floats) -> tuple[Floats, Floats]:
-    """Average and final displacement error, both (S, B), of samples (S, B, T, N, P) to the expert's trajectory (B, T, N, P)."""
+    """Average and final displacement error, both (S, B), of samples (S, B, T, N, P) to the expert's trajectory (B, T,
+    N, P).
+    """
     distance = np.linalg.norm(samples - expert[None], axis=-1)
     return distance.mean(axis=(2, 3)), distance[:, :, -1].mean(axis=2)
 

@@ -26,7 +26,8 @@ def quick_metrics(predicted: Floats, truth: Trajectories, centre_lines: Floats, 
 def full_metrics(samples: Floats, truth: Trajectories, centre_lines: Floats, scaling: Scaling) -> dict[str, float]:
     """The metrics of a final evaluation, from raw samples (S, B, T, N, P), the start included.
 
-    All S rollouts of all starts count in the quick metrics, and in ade and fde (raw units); min_ade_20 and min_fde_20 take the best of the S samples of each start.
+    All S rollouts of all starts count in the quick metrics, and in ade and fde (raw units); min_ade_20 and min_fde_20
+    take the best of the S samples of each start.
     """
     s, b = samples.shape[:2]
     repeated = Trajectories(

@@ -6,7 +6,8 @@ Terms = dict[str, Tensor]
 
 
 def ssail_loss(generated: Tensor, expert: Tensor, mixed: Tensor, alpha: Tensor) -> tuple[Tensor, Terms]:
-    """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (alpha - D(tau_alpha))^2, each a mean over trajectories, steps and agents.
+    """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (alpha - D(tau_alpha))^2, each a mean over trajectories, steps and
+    agents.
 
     generated, expert, mixed: (B, T, N) outputs of D; alpha: (B,) labels of the mixed trajectories.
     """

@@ -1,10 +1,12 @@
 """tau_alpha: mixing generated and expert trajectories, labelled by alpha (sections 3.1.1 and 3.1.3).
 
-The paper prints tau_alpha = alpha * tau_G + (1 - alpha) * tau_E with label alpha, which contradicts D(tau_G) = 0 and D(tau_E) = 1. Here, as in the rest
-of its text, alpha = 0 is the generated trajectory and alpha = 1 the expert: tau_alpha = (1 - alpha) * tau_G + alpha * tau_E (docs/paper.md).
+The paper prints tau_alpha = alpha * tau_G + (1 - alpha) * tau_E with label alpha, which contradicts D(tau_G) = 0 and
+D(tau_E) = 1. Here, as in the rest of its text, alpha = 0 is the generated trajectory and alpha = 1 the expert:
+tau_alpha = (1 - alpha) * tau_G + alpha * tau_E (docs/paper.md).
 """
 
 import torch
+from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
@@ -26,3 +28,15 @@ def nearest(generated: Tensor, experts: Tensor) -> Tensor:
     """
     distances = torch.cdist(generated.flatten(1), experts.flatten(1))
     return distances.nan_to_num(nan=torch.inf).argmin(dim=1)
+
+
+def assignment(generated: Tensor, experts: Tensor) -> Tensor:
+    """(B,) permutation that pairs each generated trajectory with its own expert of a batch of equal size, least total
+    squared distance.
+
+    This is the optimal transport between the two batches. Where the policy neglects one of the expert's modes, some
+    generated trajectories are paired across to it; where it uses all modes as the expert does, it pairs like `nearest`.
+    """
+    distances = torch.cdist(generated.flatten(1), experts.flatten(1)).square().nan_to_num(nan=1e30, posinf=1e30)
+    _, columns = linear_sum_assignment(distances.cpu().numpy())
+    return torch.as_tensor(columns, device=generated.device)

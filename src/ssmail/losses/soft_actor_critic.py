@@ -1,7 +1,9 @@
-"""Soft actor-critic (Haarnoja et al. 2018) for N agents that each have their own return. All tensors are (B, T, N) unless said otherwise.
+"""Soft actor-critic (Haarnoja et al. 2018) for N agents that each have their own return. All tensors are (B, T, N)
+unless said otherwise.
 
-Where implementations differ silently, ssmail takes: the target entropy as given per action dimension (spec: sac.target_entropy), the temperature
-loss on log temperature, and no terminal states, because episodes end by truncation only.
+Where implementations differ silently, ssmail takes: the target entropy as given per action dimension (spec:
+sac.target_entropy), the temperature loss on log temperature, and no terminal states, because episodes end by truncation
+only.
 """
 
 from torch import Tensor
@@ -24,5 +26,7 @@ def actor_loss(q: Tensor, log_prob: Tensor, temperature: Tensor) -> Tensor:
 
 
 def temperature_loss(log_temperature: Tensor, log_prob: Tensor, target_entropy: float) -> Tensor:
-    """-log(temperature) * (log pi + target): raises the temperature while the entropy is below its target (nats per agent)."""
+    """-log(temperature) * (log pi + target): raises the temperature while the entropy is below its target (nats per
+    agent).
+    """
     return -(log_temperature * (log_prob.detach() + target_entropy)).mean()

@@ -1,4 +1,6 @@
-"""The actor of G-SAC (section 3.2.2): edge-type-weighted messages -> a squashed Gaussian over each agent's next velocity."""
+"""The actor of G-SAC (section 3.2.2): edge-type-weighted messages -> a squashed Gaussian over each agent's next
+velocity.
+"""
 
 import math
 
@@ -10,7 +12,9 @@ from ssmail.spec import ModelSpec
 
 
 class Actor(nn.Module):
-    """a = c + d * tanh(u), u ~ N(mean, std): c is the current velocity, kept so far inside the bound that |a| <= action_bound."""
+    """a = c + d * tanh(u), u ~ N(mean, std): c is the current velocity, kept so far inside the bound that |a| <=
+    action_bound.
+    """
 
     def __init__(self, inputs: int, action_size: int, spec: ModelSpec) -> None:
         super().__init__()
@@ -18,8 +22,9 @@ class Actor(nn.Module):
         self.log_std_range = (spec.log_std_min, spec.log_std_max)
         self.messages = TypedMessages(inputs, spec.hidden, spec.edge_types, spec.first_type_is_none)
         self.head = perceptron(spec.hidden + inputs, spec.hidden, 2 * action_size)
+        last = self.head[-1]
+        assert isinstance(last, nn.Linear)
         with torch.no_grad():  # the untrained policy drives straight on
-            last = self.head[-1]
             last.weight.mul_(0.1)
             last.bias.zero_()
 
@@ -31,7 +36,9 @@ class Actor(nn.Module):
         return mean, low + (high - low) * torch.sigmoid(raw)
 
     def sample(self, x: Tensor, graph: Tensor, velocity: Tensor, noise: Tensor) -> Tensor:
-        """Actions (..., N, A) for standard normal `noise` (..., N, A) and the current velocity; zero noise gives the mean action."""
+        """Actions (..., N, A) for standard normal `noise` (..., N, A) and the current velocity; zero noise gives the
+        mean action.
+        """
         mean, log_std = self.distribution(x, graph)
         return self.squash(mean + log_std.exp() * noise, velocity)
 

@@ -8,7 +8,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Features:
-    """[state, time, first state] per agent. `steps` is the trajectory length that the step index is scaled with: 0 .. steps - 1 -> -1 .. 1."""
+    """[state, time, first state] per agent. `steps` is the trajectory length that the step index is scaled with: 0 ..
+    steps - 1 -> -1 .. 1.
+    """
 
     time: bool
     start: bool

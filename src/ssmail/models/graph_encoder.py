@@ -1,9 +1,11 @@
-"""The graph encoder (section 3.2.1): node -> edge -> node -> edge messages, an LSTM per edge, a softmax over edge types.
+"""The graph encoder (section 3.2.1): node -> edge -> node -> edge messages, an LSTM per edge, a softmax over edge
+types.
 
-As in the paper there is no prior network. How the graph is *sampled* is left open there, and it matters: the sampled graph is all
-the randomness that a whole group shares. A graph is the arg max of logits plus Gumbel noise; `GraphNoise` says for how many edges and for how long
-one draw holds. With one draw for all edges and the whole trajectory the marginal distribution of every edge at every step is still
-exactly the softmax, but the group commits to one graph and so to one of the expert's modes (docs/paper.md).
+As in the paper there is no prior network. How the graph is *sampled* is left open there, and it matters: the sampled
+graph is all the randomness that a whole group shares. A graph is the arg max of logits plus Gumbel noise; `GraphNoise`
+says for how many edges and for how long one draw holds. With one draw for all edges and the whole trajectory the
+marginal distribution of every edge at every step is still exactly the softmax, but the group commits to one graph and
+so to one of the expert's modes (docs/paper.md).
 """
 
 from dataclasses import dataclass
@@ -29,7 +31,9 @@ class GraphEncoder(nn.Module):
         self.head = nn.Linear(hidden, edge_types)
 
     def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
-        """x (B, T, N, D) -> logits (B, T, N, N, K) and the memory after the last step; step t reads x[:, : t + 1] only."""
+        """x (B, T, N, D) -> logits (B, T, N, N, K) and the memory after the last step; step t reads x[:, : t + 1]
+        only.
+        """
         b, t, n, _ = x.shape
         edges = self.edges_in(x)
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
@@ -40,7 +44,9 @@ class GraphEncoder(nn.Module):
         return on_diagonal(logits, n), memory
 
     def _remember(self, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
-        """The LSTM over (edges, T, H). A single step, as in a rollout, takes the cell itself, which costs half as much."""
+        """The LSTM over (edges, T, H). A single step, as in a rollout, takes the cell itself, which costs half as
+        much.
+        """
         if sequences.shape[1] > 1:
             embedded, (hidden, cell) = self.lstm(sequences, memory)
             return embedded, (hidden, cell)
@@ -54,7 +60,9 @@ class GraphEncoder(nn.Module):
 def off_diagonal(pairs: Tensor) -> Tensor:
     """(B, T, N, N, H) -> (B, T, N * (N - 1), H): the edges between different agents, row by row."""
     b, t, n, _, h = pairs.shape
-    return pairs.reshape(b, t, n * n, h)[:, :, 1:].view(b, t, n - 1, n + 1, h)[:, :, :, :n].reshape(b, t, n * (n - 1), h)
+    return (
+        pairs.reshape(b, t, n * n, h)[:, :, 1:].view(b, t, n - 1, n + 1, h)[:, :, :, :n].reshape(b, t, n * (n - 1), h)
+    )
 
 
 def on_diagonal(edges: Tensor, agents: int) -> Tensor:
@@ -85,7 +93,9 @@ class GraphNoise:
 
 
 def sample_graph(logits: Tensor, noise: Tensor, temperature: float) -> Tensor:
-    """One-hot edge types (..., K) = arg max(logits + Gumbel noise), with the gradient of the softmax at `temperature` (straight-through)."""
+    """One-hot edge types (..., K) = arg max(logits + Gumbel noise), with the gradient of the softmax at `temperature`
+    (straight-through).
+    """
     soft = torch.softmax((logits + noise) / temperature, dim=-1)
     hard = nn.functional.one_hot(soft.argmax(dim=-1), soft.shape[-1]).to(soft.dtype)
     return hard + soft - soft.detach()

@@ -1,8 +1,9 @@
 """Message passing on the complete directed graph of N agents (Eq. 4; Kipf et al. 2018), batched over any leading axes.
 
-The first layer of an edge function reads [x_i, x_j]; because it is linear it is applied per node, W [x_i, x_j] = W_s x_i + W_r x_j, and
-broadcast to all pairs. That equals gathering both ends of each edge, without the gather. Axis -3 of a pair tensor is the sender i, axis -2
-the receiver j. Sums over senders are divided by N - 1, so that one set of weights suits any number of agents.
+The first layer of an edge function reads [x_i, x_j]; because it is linear it is applied per node, W [x_i, x_j] = W_s
+x_i + W_r x_j, and broadcast to all pairs. That equals gathering both ends of each edge, without the gather. Axis -3 of
+a pair tensor is the sender i, axis -2 the receiver j. Sums over senders are divided by N - 1, so that one set of
+weights suits any number of agents.
 """
 
 import torch
@@ -21,7 +22,8 @@ def others(agents: int, like: Tensor) -> Tensor:
 
 def mean_over_senders(pairs: Tensor) -> Tensor:
     """(..., N, N, H) -> (..., N, H): the mean over i != j; zeros for a single agent."""
-    return (pairs * others(pairs.shape[-2], pairs)).sum(dim=-3)
+    mean: Tensor = (pairs * others(pairs.shape[-2], pairs)).sum(dim=-3)
+    return mean
 
 
 class PairLayer(nn.Module):
@@ -51,7 +53,9 @@ class EdgeFunction(nn.Module):
         return out
 
     def messages(self, x: Tensor) -> Tensor:
-        """Their mean over senders: x (..., N, D) -> (..., N, H). The second layer is linear, so it is applied after the mean."""
+        """Their mean over senders: x (..., N, D) -> (..., N, H). The second layer is linear, so it is applied after
+        the mean.
+        """
         out: Tensor = self.second(mean_over_senders(torch.relu(self.first(x))))
         return out
 
@@ -74,7 +78,8 @@ class TypedMessages(nn.Module):
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
         """x (..., N, D) and graph (..., N, N, K) -> (..., N, H)."""
         weights = graph[..., self.skipped :] * others(x.shape[-2], x)
-        embedded = torch.relu(self.first(x)).unflatten(-1, (self.types, -1))
+        embedded = torch.relu(self.first(x))
+        embedded = embedded.view(*embedded.shape[:-1], self.types, -1)
         received = (embedded * weights.unsqueeze(-1)).sum(dim=-4).flatten(-2)
         messages: Tensor = self.second(received) + self.type_bias(weights.sum(dim=-3))
         return messages

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.adversarial import ssail_loss
-from ssmail.losses.self_supervision import mix, nearest, sample_alpha
+from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
@@ -18,7 +18,7 @@ from ssmail.models.features import Features
 from ssmail.models.graph_encoder import graph_entropy
 from ssmail.models.policy import GraphPolicy
 from ssmail.rewards import ssail_reward
-from ssmail.spec import RunSpec
+from ssmail.spec import Pairing, RunSpec
 from ssmail.training.replay import Batch, Replay
 from ssmail.training.seeding import Generators
 
@@ -54,7 +54,9 @@ class AdversarialLearner:
         self.optimizers = {
             "actor": torch.optim.Adam(self.policy.parameters(), lr=spec.sac.actor_learning_rate, fused=True),
             "critic": torch.optim.Adam(self.critic.parameters(), lr=spec.sac.critic_learning_rate, fused=True),
-            "discriminator": torch.optim.Adam(self.discriminator.parameters(), lr=spec.adversarial.learning_rate, fused=True),
+            "discriminator": torch.optim.Adam(
+                self.discriminator.parameters(), lr=spec.adversarial.learning_rate, fused=True
+            ),
             "temperature": torch.optim.Adam([self.log_temperature], lr=spec.sac.temperature_learning_rate, fused=True),
         }
         self.base_rates = {name: o.param_groups[0]["lr"] for name, o in self.optimizers.items()}
@@ -90,17 +92,20 @@ class AdversarialLearner:
     def _pick(self, source: Batch, count: int) -> Batch:
         return source[torch.randint(len(source), (count,), generator=self.generators["data"]).to(self.device)]
 
-    def _pair(self, generated: Batch) -> Batch:
+    def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
         """The expert trajectory that each generated one is mixed with."""
-        if self.spec.adversarial.pairing == "start":
+        if pairing == "start":
             return self.experts[generated.source]
-        return self.experts[nearest(generated.states, self.experts.states)]
+        if pairing == "nearest":
+            return self.experts[nearest(generated.states, self.experts.states)]
+        drawn = self._pick(self.experts, len(generated))
+        return drawn[assignment(generated.states, drawn.states)]
 
-    def _mixed(self, generated: Batch) -> tuple[Batch, Tensor]:
+    def _mixed(self, generated: Batch, pairing: Pairing) -> tuple[Batch, Tensor]:
         """tau_alpha and its alphas for a batch of tau_G."""
         low, high = self.spec.adversarial.alpha_low, self.spec.adversarial.alpha_high
         alpha = sample_alpha(len(generated), low, high, self.generators["alpha"]).to(self.device)
-        expert = self._pair(generated)
+        expert = self._pair(generated, pairing)
         states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
         return Batch(states, actions, generated.source), alpha
 
@@ -121,11 +126,12 @@ class AdversarialLearner:
             parts.append(replay.sample(past, self.generators["data"]))
         generated = Batch.concatenate(parts)
         expert = self._pick(self.experts, b)
-        mixed, alpha = self._mixed(generated)
+        mixed, alpha = self._mixed(generated, self.spec.adversarial.pairing)
         everything = Batch.concatenate([generated, expert, mixed])
         chosen = self._pick_steps(everything.actions.shape[1])
-        outputs = self.discriminator(self._inputs(everything)[:, chosen], everything.actions[:, chosen]).chunk(3)
-        loss, terms = ssail_loss(*outputs, alpha)
+        outputs = self.discriminator(self._inputs(everything)[:, chosen], everything.actions[:, chosen])
+        on_generated, on_expert, on_mixed = outputs.chunk(3)
+        loss, terms = ssail_loss(on_generated, on_expert, on_mixed, alpha)
         self._step("discriminator", loss, self.discriminator.parameters())
         return {"discriminator/loss": loss, **{f"discriminator/{k}": v for k, v in terms.items()}}
 
@@ -133,7 +139,7 @@ class AdversarialLearner:
         b = self.spec.training.batch
         count = round(b * self.spec.sac.mixed_share)
         generated = replay.sample(b, self.generators["data"])
-        mixed, _ = self._mixed(generated[torch.arange(count)])
+        mixed, _ = self._mixed(generated[torch.arange(count)], self.spec.sac.pairing)
         batch = Batch.concatenate([mixed, generated[torch.arange(count, b)]])
 
         a = self.experts.actions.shape[-1]
@@ -141,7 +147,8 @@ class AdversarialLearner:
         next_states = self.integrator.step(states, actions)
         x = self._inputs(batch)
         next_x = self.features(next_states, batch.states[:, 0], first_step=1)
-        # The graph after step t is inferred from the states that the policy read, so one pass of the encoder serves both ends of a transition.
+        # The graph after step t is inferred from the states that the policy read, so one pass of the encoder serves
+        # both ends of a transition.
         history = torch.cat([x, next_x[:, -1:]], dim=1)
         noise = self.policy.draw_graph_noise(b, history.shape[1], states.shape[2], self.generators["policy"])
         graphs, logits, _ = self.policy.graphs(history, noise.to(self.device))
@@ -152,7 +159,9 @@ class AdversarialLearner:
 
         with torch.no_grad():
             reward = self.spec.adversarial.reward_scale * ssail_reward(self.discriminator(x, actions))
-            next_action, next_log_prob = self.policy.actor.sample_with_log_prob(next_x, next_graph, next_states[..., a:], self._noise(actions))
+            next_action, next_log_prob = self.policy.actor.sample_with_log_prob(
+                next_x, next_graph, next_states[..., a:], self._noise(actions)
+            )
             next_q = self.target_critic(next_x, next_action, next_graph)
             target = critic_target(reward, next_q, next_log_prob, self.temperature, self.spec.sac.gamma)
         fixed_graph = graph.detach()
@@ -167,7 +176,9 @@ class AdversarialLearner:
         self._step("actor", policy_loss - self.spec.sac.graph_entropy * edge_entropy, self.policy.parameters())
         if self.spec.sac.automatic_temperature:
             target_entropy = self.spec.sac.target_entropy * a
-            self._step("temperature", temperature_loss(self.log_temperature, log_prob, target_entropy), [self.log_temperature])
+            self._step(
+                "temperature", temperature_loss(self.log_temperature, log_prob, target_entropy), [self.log_temperature]
+            )
         self._follow()
         return {
             "critic/loss": value_loss,
@@ -191,7 +202,7 @@ class AdversarialLearner:
     @torch.no_grad()
     def _follow(self) -> None:
         """Move the target critics (Polyak averaging) and the averaged policy towards their sources."""
-        pairs = [(self.target_critic, self.critic, self.spec.sac.polyak)]
+        pairs: list[tuple[nn.Module, nn.Module, float]] = [(self.target_critic, self.critic, self.spec.sac.polyak)]
         if self.spec.training.policy_average > 0:
             pairs.append((self.average, self.policy, 1 - self.spec.training.policy_average))
         for follower, source, rate in pairs:
@@ -201,7 +212,11 @@ class AdversarialLearner:
         """Everything that an update changes."""
         networks = {n: getattr(self, n).state_dict() for n in NETWORKS}
         optimizers = {n: o.state_dict() for n, o in self.optimizers.items()}
-        return {"networks": networks, "optimizers": optimizers, "log_temperature": self.log_temperature.detach().clone()}
+        return {
+            "networks": networks,
+            "optimizers": optimizers,
+            "log_temperature": self.log_temperature.detach().clone(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`."""

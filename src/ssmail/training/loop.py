@@ -1,4 +1,5 @@
-"""The training loop: epochs of rollouts and updates, validation, the best model, and everything needed to continue later.
+"""The training loop: epochs of rollouts and updates, validation, the best model, and everything needed to continue
+later.
 
 It yields metrics and knows nothing of where they are stored.
 """
@@ -29,7 +30,7 @@ from ssmail.training.rollout import rollout
 from ssmail.training.seeding import Generators
 
 
-class Divergence(SsmailError):
+class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fault
     """Training left the finite numbers."""
 
 
@@ -60,7 +61,9 @@ class TrainingLoop:
         self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
 
     def run_epoch(self) -> dict[str, float]:
-        """One epoch of Alg. 1 and its validation; returns the epoch's metrics. Raises Divergence when weights stop being finite."""
+        """One epoch of Alg. 1 and its validation; returns the epoch's metrics. Raises Divergence when weights stop
+        being finite.
+        """
         began = time.perf_counter()
         epochs = self.spec.training.epochs
         frequency = intervention_frequency(self.spec.curriculum, self.epoch, epochs)
@@ -81,7 +84,9 @@ class TrainingLoop:
         return values | {"seconds": time.perf_counter() - began}
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Metrics of the best-validation model on the test split (sampled, mean), of the last model, and of constant velocity; and the arrays to draw."""
+        """Metrics of the best-validation model on the test split (sampled, mean), of the last model, and of constant
+        velocity; and the arrays to draw.
+        """
         truth, lines = self.data.test, self.data.centre_lines
         best = deepcopy(self.learner.evaluated_policy())
         best.load_state_dict(self.best_weights)
@@ -95,7 +100,7 @@ class TrainingLoop:
         values = {"best_epoch": float(self.best_epoch)}
         for prefix, samples in candidates.items():
             values |= {f"{prefix}/{k}": v for k, v in full_metrics(samples, truth, lines, self.scaling).items()}
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "test/rollouts": sampled.astype(np.float32),
             "test/expert": truth.positions.astype(np.float32),
             "test/lanes": truth.continuations.astype(np.float32),
@@ -132,9 +137,11 @@ class TrainingLoop:
         """Scaled states (B, T, N, 2P) and the actions (B, T - 1, N, P) that led from each to the next."""
         velocities = self.scaling.scale_velocities(trajectories.velocities)
         states = np.concatenate([self.scaling.scale_positions(trajectories.positions), velocities], axis=-1)
-        to = {"dtype": torch.float32, "device": self.device}
         source = torch.arange(len(trajectories), device=self.device)
-        return Batch(torch.as_tensor(states).to(**to), torch.as_tensor(velocities[:, 1:]).to(**to), source)  # type: ignore[arg-type]
+        return Batch(self._tensor(states), self._tensor(velocities[:, 1:]), source)
+
+    def _tensor(self, array: Floats) -> Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self.device)
 
     def _learning_rate_factor(self) -> float:
         """1 up to decay_start, then linearly down to learning_rate_final in the last epoch."""
@@ -179,8 +186,11 @@ class TrainingLoop:
         validation = self.data.validation
         start = torch.cat([self._scaled(validation).states[:, 0], self._scaled(train).states[:, 0]])
         positions = self._free_run(self.learner.evaluated_policy(), start)
-        values = {}
-        parts = {"validation": (positions[: len(validation)], validation), "train": (positions[len(validation) :], train)}
+        values: dict[str, float] = {}
+        parts = {
+            "validation": (positions[: len(validation)], validation),
+            "train": (positions[len(validation) :], train),
+        }
         for split, (predicted, truth) in parts.items():
             measured = quick_metrics(predicted, truth, self.data.centre_lines, self.scaling)
             values |= {f"{split}/{k}": v for k, v in measured.items()}
@@ -189,7 +199,9 @@ class TrainingLoop:
     def _free_run(self, policy: GraphPolicy, start: Tensor, deterministic: bool = False) -> Floats:
         """Raw positions (B, T, N, P) of one free-running rollout from each start (B, N, D), the start included."""
         generator = self.generators["evaluation"]
-        made = rollout(policy, self.features, self.integrator, start, self.steps, generator, deterministic=deterministic)
+        made = rollout(
+            policy, self.features, self.integrator, start, self.steps, generator, deterministic=deterministic
+        )
         scaled = made.states[..., : policy.action_size].double().cpu().numpy()
         raw: Floats = self.scaling.unscale_positions(scaled)
         return raw

@@ -9,7 +9,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Batch:
-    """B trajectories: states (B, T + 1, N, D), actions (B, T, N, A), and source (B,), the expert trajectory that each one started from."""
+    """B trajectories: states (B, T + 1, N, D), actions (B, T, N, A), and source (B,), the expert trajectory that each
+    one started from.
+    """
 
     states: Tensor
     actions: Tensor

@@ -1,4 +1,6 @@
-"""One seed -> independent generators, so that e.g. a change of the alpha range leaves the initial weights as they were."""
+"""One seed -> independent generators, so that e.g. a change of the alpha range leaves the initial weights as they
+were.
+"""
 
 from typing import Any
 
@@ -9,7 +11,9 @@ PURPOSES = ("data", "weights", "policy", "alpha", "curriculum", "evaluation")
 
 
 class Generators:
-    """One torch generator for each purpose: data order, initial weights, policy noise, alpha, interventions, evaluation rollouts."""
+    """One torch generator for each purpose: data order, initial weights, policy noise, alpha, interventions,
+    evaluation rollouts.
+    """
 
     def __init__(self, seed: int) -> None:
         children = np.random.SeedSequence(seed).spawn(len(PURPOSES))
