@@ -16,6 +16,7 @@ SPEC = ModelSpec(
     encoder_hidden=6,
     edge_types=3,
     first_type_is_none=True,
+    own_input=True,
     graph_temperature=0.5,
     graph_noise="shared",
     graph_resample="trajectory",
@@ -44,7 +45,7 @@ def test_networks_are_equivariant_to_the_order_of_agents(size: tuple[int, int, i
     order = torch.randperm(n)
     moved, moved_action, moved_graph = x[:, :, order], action[:, :, order], graph[:, :, order][:, :, :, order]
 
-    actor, critic = Actor(d, 2, SPEC), TwinCritic(d + 2, 8, 3, True)
+    actor, critic = Actor(d, 2, SPEC), TwinCritic(d + 2, SPEC)
     discriminator, encoder = Discriminator(d + 2, 8), GraphEncoder(d, 6, 3)
     for out, moved_out in zip(actor.distribution(x, graph), actor.distribution(moved, moved_graph), strict=True):
         assert out.shape == (b, t, n, 2)
@@ -77,7 +78,7 @@ def test_no_message_flows_along_an_edge_of_type_none(n: int, seed: int) -> None:
     torch.manual_seed(seed)
     x, disturbed = torch.randn(1, 1, n, 4), torch.randn(1, 1, n, 4)
     disturbed[:, :, 0] = x[:, :, 0]
-    actor, critic = Actor(4, 2, SPEC), TwinCritic(4, 8, 3, True)
+    actor, critic = Actor(4, 2, SPEC), TwinCritic(4, SPEC)
 
     def outputs(inputs: Tensor, edge_type: int) -> Tensor:
         graph = torch.zeros(1, 1, n, n, 3)

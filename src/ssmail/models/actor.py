@@ -21,7 +21,8 @@ class Actor(nn.Module):
         self.step, self.bound = spec.action_step, spec.action_bound
         self.log_std_range = (spec.log_std_min, spec.log_std_max)
         self.messages = TypedMessages(inputs, spec.hidden, spec.edge_types, spec.first_type_is_none)
-        self.head = perceptron(spec.hidden + inputs, spec.hidden, 2 * action_size)
+        self.own_input = spec.own_input
+        self.head = perceptron(spec.hidden + inputs * spec.own_input, spec.hidden, 2 * action_size)
         last = self.head[-1]
         assert isinstance(last, nn.Linear)
         with torch.no_grad():  # the untrained policy drives straight on
@@ -30,7 +31,8 @@ class Actor(nn.Module):
 
     def distribution(self, x: Tensor, graph: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log std of u, each (..., N, A), from inputs (..., N, D) and graph (..., N, N, K)."""
-        out = self.head(torch.cat([self.messages(x, graph), x], dim=-1))
+        messages = self.messages(x, graph)
+        out = self.head(torch.cat([messages, x], dim=-1) if self.own_input else messages)
         mean, raw = out.chunk(2, dim=-1)
         low, high = self.log_std_range
         return mean, low + (high - low) * torch.sigmoid(raw)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.message_passing import TypedMessages
+from ssmail.spec import ModelSpec
 
 
 class TwinLinear(nn.Module):
@@ -28,17 +29,20 @@ class TwinCritic(nn.Module):
     Each agent has its own return (the discriminator scores every agent), learned from the messages of all others.
     """
 
-    def __init__(self, inputs: int, hidden: int, edge_types: int, first_is_none: bool) -> None:
+    def __init__(self, inputs: int, spec: ModelSpec) -> None:
         super().__init__()
-        self.messages = nn.ModuleList(TypedMessages(inputs, hidden, edge_types, first_is_none) for _ in range(2))
-        self.first = TwinLinear(hidden + inputs, hidden)
+        types, none = spec.edge_types, spec.first_type_is_none
+        self.messages = nn.ModuleList(TypedMessages(inputs, spec.hidden, types, none) for _ in range(2))
+        self.own_input, hidden = spec.own_input, spec.hidden
+        self.first = TwinLinear(hidden + inputs * spec.own_input, hidden)
         self.second = TwinLinear(hidden, hidden)
         self.last = TwinLinear(hidden, 1)
 
     def forward(self, x: Tensor, action: Tensor, graph: Tensor) -> Tensor:
         """x (..., N, D), action (..., N, A), graph (..., N, N, K) -> (..., N, 2)."""
         inputs = torch.cat([x, action], dim=-1)
-        h = torch.stack([torch.cat([m(inputs, graph), inputs], dim=-1) for m in self.messages], dim=-2)
+        messages = [m(inputs, graph) for m in self.messages]
+        h = torch.stack([torch.cat([m, inputs], dim=-1) if self.own_input else m for m in messages], dim=-2)
         h = torch.relu(self.first(h))
         h = torch.relu(self.second(h))
         q: Tensor = self.last(h).squeeze(-1)

@@ -17,7 +17,8 @@ def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
 
 def others(agents: int, like: Tensor) -> Tensor:
     """(N, N, 1) weights of the mean over senders: 1 / (N - 1) off the diagonal, 0 on it."""
-    return (1 - torch.eye(agents, dtype=like.dtype, device=like.device)).unsqueeze(-1) / max(agents - 1, 1)
+    self_edges = torch.eye(agents, dtype=like.dtype, device=like.device).unsqueeze(-1)
+    return torch.sub(1, self_edges) / max(agents - 1, 1)
 
 
 def mean_over_senders(pairs: Tensor) -> Tensor:
@@ -36,7 +37,8 @@ class PairLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Pre-activations for every ordered pair, the diagonal included."""
-        return self.sender(x).unsqueeze(-2) + self.receiver(x).unsqueeze(-3)
+        pairs: Tensor = self.sender(x).unsqueeze(-2) + self.receiver(x).unsqueeze(-3)
+        return pairs
 
 
 class EdgeFunction(nn.Module):

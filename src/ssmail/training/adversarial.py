@@ -42,9 +42,7 @@ class AdversarialLearner:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(generators.seeds["weights"])
             self.policy = GraphPolicy(inputs, action_size, spec.model)
-            self.critic = TwinCritic(
-                inputs + action_size, spec.model.hidden, spec.model.edge_types, spec.model.first_type_is_none
-            )
+            self.critic = TwinCritic(inputs + action_size, spec.model)
             self.discriminator = Discriminator(inputs + action_size, spec.model.hidden)
         for network in (self.policy, self.critic, self.discriminator):
             network.to(self.device)
