@@ -39,7 +39,7 @@ def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, a
         stored = arrays(shift)["test/rollouts"]
         expected = [stored[0, 0], stored[1, 1], stored[0, 2]]  # start b with sample b % 2
         np.testing.assert_array_equal(panel.rollouts, expected)
-        assert (panel.on_lane, panel.lane_balance, panel.outside) == (0.9, 0.25, 0)
+        assert (panel.on_lane, panel.lane_balance, record.outside(panel)) == (0.9, 0.25, 0)
     np.testing.assert_array_equal(record.expert, lanes())
     assert record.provenance.run_ids == tuple(runs)
 
@@ -80,15 +80,29 @@ def same(drawn: list[np.ndarray], rows: pd.DataFrame, keys: list[str]) -> bool:
     return len(drawn) == len(tracks) and all(np.array_equal(a, b) for a, b in zip(drawn, tracks, strict=True))
 
 
+def test_the_frame_widens_for_rollouts_but_only_so_far(store: Store, add_run: Any) -> None:
+    add_run(0)
+    tight = fig5_modes.collect(store).frame
+    side = np.ptp(lanes().reshape(-1, 2), axis=0).max()
+    wide = arrays()["test/rollouts"]
+    wide[0, 0, 4, 0, 1] = lanes()[..., 1].max() + 0.15 * side
+    add_run(0, test__rollouts=wide)
+    record = fig5_modes.collect(store)
+    assert record.outside(record.panels[0]) == 0
+    assert record.frame[3] == pytest.approx(lanes()[..., 1].max() + 0.2 * side)
+    assert record.frame[:3] == tight[:3]
+
+
 def test_what_leaves_the_frame_is_counted(store: Store, add_run: Any) -> None:
     wild = arrays()["test/rollouts"]
     wild[0, 0, 3:, 0, 1] = 50.0
     wild[1, 1, 4, 1] = np.nan
+    wild[0, 2, 4, 0, 0] = -np.inf
     add_run(0, test__rollouts=wild)
     record = fig5_modes.collect(store)
-    assert record.panels[0].outside == 2
+    assert record.outside(record.panels[0]) == 3
     (axes,) = panels(fig5_modes.draw(record))
-    assert words(axes)[-1] == "2 of 3 cut at the frame"
+    assert words(axes)[-1] == "3 of 3 cut off"
     assert axes.get_ylim()[1] < 50
 
 
@@ -96,7 +110,7 @@ def test_a_diverged_seed_has_a_panel_that_says_so(store: Store, add_run: Any) ->
     add_run(0)
     lost = add_run(1, [0.5, np.inf], RunState.DIVERGED)
     record = fig5_modes.collect(store)
-    assert [panel.diverged for panel in record.panels] == [False, True]
+    assert [panel.rollouts is None for panel in record.panels] == [False, True]
     first, second = panels(fig5_modes.draw(record))
     assert words(second) == ["seed 1", "diverged:", "no test rollouts"]
     assert "diverged:" not in words(first)

@@ -18,6 +18,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from ssmail.errors import InputError
 from ssmail.figures import style
@@ -134,6 +135,8 @@ def draw(record: StabilityRecord) -> Figure:
         axes.set_xlabel("epoch")
         axes.set_ylabel("training error, mode_mse\n(squared scaled units)")
         axes.set_ylim(*_limits(record))
+        axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+        axes.grid(which="minor", axis="y", lw=0.2)  # all there is when the errors stay within a decade
         strokes = style.strokes([band.label for band in record.bands])
         handles = [_draw_band(axes, band, strokes[band.label]) for band in record.bands]
         if record.constant_velocity is not None:

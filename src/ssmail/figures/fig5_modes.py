@@ -30,6 +30,7 @@ from ssmail.store import RunRow, RunState, Store
 NAME = "fig5"
 STARTS = 16
 ON_LANE, LANE_BALANCE = "test/on_lane", "test/lane_balance"
+REACH = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
 LANE_WIDTH = 3.5  # points: the expert shows as a wide lane beneath the rollouts
 
 Floats = npt.NDArray[np.floating]
@@ -46,12 +47,6 @@ class Panel:
     rollouts: Floats | None  # (R, T, N, 2) step lengths; None when the run diverged
     on_lane: float  # 0..1 over all rollouts; NaN when the run diverged
     lane_balance: float  # 0..0.5 likewise
-    outside: int  # how many of the R rollouts leave the frame or are not finite
-
-    @property
-    def diverged(self) -> bool:
-        """Whether the run diverged while it was trained."""
-        return self.rollouts is None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +67,17 @@ class ModesRecord:
         lanes = [_points(lane, kind="expert", lane=index) for index, lane in enumerate(self.expert)]
         table = pd.concat([*lanes, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
         order = ["kind", "label", "run_id", "seed", "on_lane", "lane_balance", "lane"]
-        return table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
+        table = table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
+        return table.astype(dict.fromkeys(["seed", "lane", "trajectory", "agent", "step"], "Int64"))
+
+    def outside(self, panel: Panel) -> int:
+        """How many of a panel's rollouts leave the frame or are not finite."""
+        if panel.rollouts is None:
+            return 0
+        x_from, x_to, y_from, y_to = self.frame
+        x, y = panel.rollouts[..., 0], panel.rollouts[..., 1]
+        inside = (x >= x_from) & (x <= x_to) & (y >= y_from) & (y <= y_to)  # False for NaN
+        return int((~inside).any(axis=(1, 2)).sum())
 
 
 def collect(store: Store, runs: Sequence[str] | None = None) -> ModesRecord:
@@ -86,11 +91,11 @@ def collect(store: Store, runs: Sequence[str] | None = None) -> ModesRecord:
             raise InputError(f"run {run.name} ({run.state}) has no test rollouts; leave it out or train it to its end.")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = _expert(store, finished[0]) if finished else np.empty((0, 0, 0, 0, 2))
-    frame = _frame(expert)
+    panels = _panels(store, selection)
     return ModesRecord(
-        panels=_panels(store, selection, frame),
+        panels=panels,
         expert=expert,
-        frame=frame,
+        frame=_frame(expert, [panel.rollouts for panel in panels if panel.rollouts is not None]),
         provenance=Provenance.of(NAME, selection.runs),
         notes=selection.notes,
     )
@@ -106,32 +111,33 @@ def _expert(store: Store, run: RunRow) -> Floats:
     return lanes[:, _shown(lanes.shape[1])]
 
 
-def _frame(expert: Floats) -> Frame:
-    """The expert's extent, widened by a tenth of its larger side."""
-    if not expert.size:
+def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
+    """The extent of the expert, and of the rollouts where they leave it by at most REACH of its larger side."""
+    if not rollouts:
         return (0.0, 1.0, 0.0, 1.0)
     low, high = expert.min(axis=(0, 1, 2, 3)), expert.max(axis=(0, 1, 2, 3))
-    margin = 0.1 * (high - low).max()
+    side = (high - low).max()
+    shown = np.concatenate([positions.reshape(-1, 2) for positions in rollouts])
+    shown = np.clip(np.where(np.isfinite(shown), shown, low), low - REACH * side, high + REACH * side)
+    low, high = np.minimum(low, shown.min(axis=0)), np.maximum(high, shown.max(axis=0))
+    margin = 0.05 * side
     return (float(low[0] - margin), float(high[0] + margin), float(low[1] - margin), float(high[1] + margin))
 
 
-def _panels(store: Store, selection: Selection, frame: Frame) -> tuple[Panel, ...]:
+def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
     metrics = store.latest_metrics([run.id for run in selection.runs], names=[ON_LANE, LANE_BALANCE])
     keys = zip(metrics["run_id"].tolist(), metrics["name"].tolist(), strict=True)
     values: dict[tuple[str, str], float] = dict(zip(keys, metrics["value"].tolist(), strict=True))
-    return tuple(_panel(store, run, group.label, values, frame) for group in selection.groups for run in group.runs)
+    return tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
 
 
-def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float], frame: Frame) -> Panel:
+def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
-        return Panel(label, run.id, run.seed, None, np.nan, np.nan, 0)
+        return Panel(label, run.id, run.seed, None, np.nan, np.nan)
     samples = store.array(run.id, "test/rollouts")  # (S, B, T, N, 2)
     starts = _shown(samples.shape[1])
     rollouts = samples[np.arange(len(starts)) % len(samples), starts]
-    x, y = rollouts[..., 0], rollouts[..., 1]
-    inside = (x >= frame[0]) & (x <= frame[1]) & (y >= frame[2]) & (y <= frame[3])  # False for NaN
-    outside = int((~inside).any(axis=(1, 2)).sum())
-    return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE], outside)
+    return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
 
 
 def _points(trajectories: Floats, **columns: object) -> pd.DataFrame:
@@ -201,8 +207,8 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
         ends = panel.rollouts[:, -1].reshape(-1, 2)
         axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
         words = [f"{100 * panel.on_lane:.0f} % on lane", f"rarer lane {100 * panel.lane_balance:.0f} %"]
-        if panel.outside:
-            words.append(f"{panel.outside} of {len(panel.rollouts)} cut at the frame")
+        if outside := record.outside(panel):
+            words.append(f"{outside} of {len(panel.rollouts)} cut off")
     axes.text(0.03, 0.97, title, transform=axes.transAxes, va="top", fontsize=7, weight="bold")
     axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=6)
 
