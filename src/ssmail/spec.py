@@ -58,6 +58,7 @@ class ModelSpec(Frozen):
     edge_types: Annotated[int, Field(ge=1)]
     first_type_is_none: bool  # no message flows along an edge of the first type
     own_input: bool  # the heads of actor and critic read an agent's own features beside its messages
+    graph_gain: Positive  # scale of the edge types' own initial weights: how differently the types act before training
     graph_temperature: Positive  # of the Gumbel-softmax relaxation
     graph_noise: Literal["shared", "edge"]  # one Gumbel draw for all edges of a graph, or one for each edge
     graph_resample: Literal["trajectory", "step"]  # how often that draw is renewed

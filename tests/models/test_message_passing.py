@@ -17,6 +17,7 @@ SPEC = ModelSpec(
     edge_types=3,
     first_type_is_none=True,
     own_input=True,
+    graph_gain=2.0,
     graph_temperature=0.5,
     graph_noise="shared",
     graph_resample="trajectory",
@@ -94,7 +95,7 @@ def test_typed_messages_against_the_formula() -> None:
     """sum_i sum_k z_ijk f_k([x_i, x_j]) / (N - 1), edge by edge, self-edges left out."""
     torch.manual_seed(0)
     n, k, h = 4, 2, 5
-    layer = TypedMessages(3, h, k, first_is_none=False)
+    layer = TypedMessages(3, SPEC.model_copy(update={"hidden": h, "edge_types": k, "first_type_is_none": False}))
     x, graph = torch.randn(n, 3), torch.rand(n, n, k)
     expected = torch.zeros(n, h)
     for i in range(n):

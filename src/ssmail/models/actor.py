@@ -20,7 +20,7 @@ class Actor(nn.Module):
         super().__init__()
         self.step, self.bound = spec.action_step, spec.action_bound
         self.log_std_range = (spec.log_std_min, spec.log_std_max)
-        self.messages = TypedMessages(inputs, spec.hidden, spec.edge_types, spec.first_type_is_none)
+        self.messages = TypedMessages(inputs, spec)
         self.own_input = spec.own_input
         self.head = perceptron(spec.hidden + inputs * spec.own_input, spec.hidden, 2 * action_size)
         last = self.head[-1]

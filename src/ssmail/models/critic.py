@@ -31,8 +31,7 @@ class TwinCritic(nn.Module):
 
     def __init__(self, inputs: int, spec: ModelSpec) -> None:
         super().__init__()
-        types, none = spec.edge_types, spec.first_type_is_none
-        self.messages = nn.ModuleList(TypedMessages(inputs, spec.hidden, types, none) for _ in range(2))
+        self.messages = nn.ModuleList(TypedMessages(inputs, spec) for _ in range(2))
         self.own_input, hidden = spec.own_input, spec.hidden
         self.first = TwinLinear(hidden + inputs * spec.own_input, hidden)
         self.second = TwinLinear(hidden, hidden)

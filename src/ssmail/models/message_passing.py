@@ -9,6 +9,8 @@ weights suits any number of agents.
 import torch
 from torch import Tensor, nn
 
+from ssmail.spec import ModelSpec
+
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """Two linear layers with a SiLU between them."""
@@ -66,16 +68,19 @@ class TypedMessages(nn.Module):
     """Messages sum_k z_ijk f_e^k([x_i, x_j]), averaged over senders (section 3.2.2).
 
     The second layer of every f_e^k is linear, so it is applied after the mean: N products instead of N * N.
-    With `first_is_none` the first type has no function: no message flows along its edges.
+    With `first_type_is_none` the first type has no function: no message flows along its edges.
     """
 
-    def __init__(self, inputs: int, hidden: int, edge_types: int, first_is_none: bool) -> None:
+    def __init__(self, inputs: int, spec: ModelSpec) -> None:
         super().__init__()
-        self.skipped = int(first_is_none)
-        self.types = edge_types - self.skipped
+        hidden = spec.hidden
+        self.skipped = int(spec.first_type_is_none)
+        self.types = spec.edge_types - self.skipped
         self.first = PairLayer(inputs, hidden * self.types)
         self.second = nn.Linear(hidden * self.types, hidden, bias=False)
         self.type_bias = nn.Linear(self.types, hidden, bias=False)
+        with torch.no_grad():
+            self.type_bias.weight.mul_(spec.graph_gain)
 
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
         """x (..., N, D) and graph (..., N, N, K) -> (..., N, H)."""
