@@ -77,6 +77,7 @@ class AdversarialSpec(Frozen):
     alpha_high: Finite
     pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
     learning_rate: Positive
+    learning_rate_final: Fraction  # the last epoch's rate as a fraction of the first's
     updates: Count  # discriminator steps for each SAC step
     past_share: (
         Fraction  # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
@@ -96,7 +97,9 @@ class SacSpec(Frozen):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     polyak: Annotated[float, Field(gt=0, le=1)]
     actor_learning_rate: Positive
+    actor_learning_rate_final: Fraction  # the last epoch's rate as a fraction of the first's; the temperature's too
     critic_learning_rate: Positive
+    critic_learning_rate_final: Fraction
     temperature: NonNegative  # the fixed one, or the first one when automatic
     automatic_temperature: bool
     temperature_learning_rate: Positive
@@ -124,8 +127,7 @@ class TrainingSpec(Frozen):
     )
     rollouts: Count  # trajectories generated in each epoch
     replay: Count  # generated trajectories kept
-    learning_rate_final: Fraction  # the last epoch's learning rates, as a fraction of the first's (linear decay)
-    decay_start: Fraction  # fraction of the epochs after which the decay begins
+    decay_start: Fraction  # fraction of the epochs after which the learning rates fall, linearly, to their final values
     policy_average: Annotated[
         float, Field(ge=0, lt=1)
     ]  # decay of the averaged actor that is evaluated; 0 evaluates the actor itself

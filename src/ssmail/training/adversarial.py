@@ -57,7 +57,13 @@ class AdversarialLearner:
             ),
             "temperature": torch.optim.Adam([self.log_temperature], lr=spec.sac.temperature_learning_rate, fused=True),
         }
-        self.base_rates = {name: o.param_groups[0]["lr"] for name, o in self.optimizers.items()}
+        self.first_rates = {name: o.param_groups[0]["lr"] for name, o in self.optimizers.items()}
+        self.final_factors = {
+            "actor": spec.sac.actor_learning_rate_final,
+            "critic": spec.sac.critic_learning_rate_final,
+            "discriminator": spec.adversarial.learning_rate_final,
+            "temperature": spec.sac.actor_learning_rate_final,
+        }
 
     @property
     def temperature(self) -> Tensor:
@@ -69,10 +75,11 @@ class AdversarialLearner:
         """The policy that metrics are measured on: the averaged one when the spec asks for averaging."""
         return self.average if self.spec.training.policy_average > 0 else self.policy
 
-    def set_learning_rates(self, factor: float) -> None:
-        """Scale all learning rates of the spec by `factor`."""
+    def set_learning_rates(self, decayed: float) -> None:
+        """Put the learning rates at the fraction `decayed` (0 .. 1) of the way from their first to their final values."""
         for name, optimizer in self.optimizers.items():
-            optimizer.param_groups[0]["lr"] = factor * self.base_rates[name]
+            factor = 1 - decayed * (1 - self.final_factors[name])
+            optimizer.param_groups[0]["lr"] = factor * self.first_rates[name]
 
     def update(self, latest: Batch, replay: Replay) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""

@@ -67,7 +67,7 @@ class TrainingLoop:
         began = time.perf_counter()
         epochs = self.spec.training.epochs
         frequency = intervention_frequency(self.spec.curriculum, self.epoch, epochs)
-        self.learner.set_learning_rates(self._learning_rate_factor())
+        self.learner.set_learning_rates(self._decayed())
         latest, segment = self._generate(frequency)
         self.replay.add(latest)
         updates = [self.learner.update(latest, self.replay) for _ in range(self.spec.training.updates)]
@@ -143,12 +143,11 @@ class TrainingLoop:
     def _tensor(self, array: Floats) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
 
-    def _learning_rate_factor(self) -> float:
-        """1 up to decay_start, then linearly down to learning_rate_final in the last epoch."""
+    def _decayed(self) -> float:
+        """0 up to training.decay_start, then linearly to 1 in the last epoch."""
         training = self.spec.training
         progress = self.epoch / max(training.epochs - 1, 1)
-        decayed = max(progress - training.decay_start, 0) / max(1 - training.decay_start, 1e-9)
-        return 1 - min(decayed, 1) * (1 - training.learning_rate_final)
+        return max(progress - training.decay_start, 0) / max(1 - training.decay_start, 1e-9)
 
     def _generate(self, frequency: float) -> tuple[Batch, float]:
         """tau_G from random training starts under the curriculum, and their mean segment length."""
