@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from handmade_arrays import arrays
 
 from ssmail.experiments import build_spec
 from ssmail.store import RunState, Store
+
+from .handmade_arrays import arrays
 
 AddRun = Callable[..., str]
 

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from handmade_arrays import AGENTS, STARTS, arrays, lanes
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
 from ssmail.figures import fig5_modes, save, style
 from ssmail.store import RunState, Store
+
+from .handmade_arrays import AGENTS, STARTS, arrays, lanes
 
 
 def words(axes: Axes) -> list[str]:

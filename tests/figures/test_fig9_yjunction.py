@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from handmade_arrays import AGENTS, STEPS, lanes
 
 from ssmail.errors import InputError
 from ssmail.figures import NoRuns, fig9_yjunction, save
 from ssmail.store import RunState, Store
+
+from .handmade_arrays import AGENTS, STEPS, lanes
 
 
 def test_the_first_trajectory_of_each_lane_is_shown(store: Store, add_run: Any) -> None:
