@@ -36,7 +36,7 @@ def note(text: str) -> None:
 def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
     """Print rows; `columns` maps the keys that a table shows to headings. CSV and JSON have every key of the rows."""
     if form is Format.TABLE:
-        _print_table(rows, columns)
+        print_table(rows, columns)
     elif form is Format.CSV:
         write_csv(rows, list(rows[0]) if rows else list(columns), None)
     else:
@@ -60,28 +60,33 @@ def write_json(value: Any, out: Path | None) -> None:
 
 
 def short(value: Any) -> str:
-    """A value as a table shows it: four significant digits, minutes of UTC, a dash for nothing."""
+    """A value as a table shows it: four significant digits, month to minute of UTC, a dash for nothing."""
     if value is None or value == "":
         return "-"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, datetime):
-        return f"{value:%Y-%m-%d %H:%M}"
+        return f"{value:%m-%d %H:%M}"
     return str(value)
 
 
-def _print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
-    from rich import box
+def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
+    """A table on stdout, its columns two spaces apart where the terminal is wide enough, else one."""
     from rich.console import Console
+    from rich.measure import Measurement
     from rich.table import Table
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    cells = [[short(row.get(key)) for key in columns] for row in rows]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
-        table.add_column(heading, justify="right" if numeric else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(_plain(short(row.get(key))) for key in columns))
-    Console(soft_wrap=False).print(table)
+        table.add_column(heading, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
+    for line in cells:
+        table.add_row(*map(_plain, line))
+    console = Console()
+    if Measurement.get(console, console.options.update(max_width=10_000), table).maximum > console.width:
+        table.padding = (0, 1, 0, 0)
+    console.print(table)
 
 
 def _plain(text: str) -> Any:

@@ -51,14 +51,14 @@ def _live(seeds: Sequence[int], epochs: int) -> Iterator[Report]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("seed {task.fields[seed]}"),
+        TextColumn("{task.description}"),
         BarColumn(bar_width=12),
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TextColumn("{task.fields[status]}", markup=False),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
     with Progress(*columns, console=Console(stderr=True), speed_estimate_period=120) as progress:
-        tasks = {seed: progress.add_task("", total=epochs, start=False, seed=seed, status="waiting") for seed in seeds}
+        tasks = {seed: progress.add_task(f"seed {seed}", total=epochs, start=False, status="waiting") for seed in seeds}
 
         def report(event: "Event") -> None:
             _update(progress, tasks[event.cell.seed], event)
@@ -72,7 +72,7 @@ def _update(progress: Any, task: "TaskID", event: "Event") -> None:
     elif event.kind == "epoch":
         progress.update(task, completed=event.epoch, status=_losses(event.metrics))
     else:
-        progress.update(task, status=_headline(event))
+        progress.update(task, completed=event.epoch, status=_headline(event))
         progress.stop_task(task)
 
 

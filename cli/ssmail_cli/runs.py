@@ -1,6 +1,6 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,7 +8,7 @@ import typer
 
 from ssmail.errors import InputError
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, write_csv, write_json
+from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
 from ssmail_cli.results import KEY_METRICS, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
@@ -24,23 +24,9 @@ RUN_COLUMNS = {
     "environment": "env",
     "profile": "profile",
     "seed": "seed",
-    "spec_hash": "spec",
-    "started": "started (UTC)",
-    "wall_seconds": "seconds",
+    "spec": "spec",
+    "started": "start (UTC)",
     "test/mode_mse": "mode_mse",
-}
-COMPARE_COLUMNS = {
-    "method": "method",
-    "environment": "env",
-    "profile": "profile",
-    "spec_hash": "spec",
-    "differs": "differs in",
-    "metric": "metric",
-    "finished": "finished",
-    "mean": "mean",
-    "std": "std",
-    "median": "median",
-    "seeds": "each seed",
 }
 EXPORT_COLUMNS = ("run_id", "method", "environment", "profile", "seed", "state", "spec_hash", "name", "step", "value")
 
@@ -65,7 +51,12 @@ def list_runs(
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
         note(f"no run in {db} meets these conditions")
-    print_rows(rows_with_metrics(store, runs, ["test/mode_mse"]), RUN_COLUMNS, chosen_format(as_json, form))
+    rows = rows_with_metrics(store, runs, ["test/mode_mse"])
+    kind = chosen_format(as_json, form)
+    if kind is Format.TABLE:
+        print_table([{**row, "spec": row["spec_hash"][:8]} for row in rows], RUN_COLUMNS)
+    else:
+        print_rows(rows, RUN_COLUMNS, kind)
 
 
 @app.command()
@@ -123,12 +114,11 @@ def compare(
                 f"no run compared here has a metric '{metric}'; `ssmail runs show RUN` lists those it has."
             )
     kind = chosen_format(as_json, form)
+    if kind is Format.TABLE:
+        _print_comparisons(found, metrics or KEY_METRICS)
+        return
     seeds = sorted({seed for item in found for seed in item.values})
-    rows = [_comparison_row(item, seeds, kind) for item in found]
-    columns = {
-        key: heading for key, heading in COMPARE_COLUMNS.items() if key != "differs" or any(i.differs for i in found)
-    }
-    print_rows(rows, columns, kind)
+    print_rows([_comparison_row(item, seeds, kind) for item in found], {}, kind)
 
 
 @app.command()
@@ -230,10 +220,31 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"section": "artifact", "name": item["name"], "step": None, "value": item["path"]}
 
 
-def _comparison_row(item: "Comparison", seeds: list[int], kind: Format) -> dict[str, Any]:
-    """One group and metric. A seed without a value shows its run's state in its place."""
-    from ssmail_cli.display import short
+def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> None:
+    """A table for each spec: its seeds downwards, then mean, std and median; the metrics across."""
+    names = {metric: metric.replace("_constant_velocity", " constant velocity") for metric in metrics}
+    columns = {"seed": "seed", **{metric: name.replace("/", "/\n") for metric, name in names.items()}}
+    for first in found[:: len(metrics)]:
+        group = [item for item in found if item.spec_hash == first.spec_hash]
+        rows: list[dict[str, Any]] = [
+            {"seed": _seed_label(first, seed), **{item.metric: item.values[seed] for item in group}}
+            for seed in first.values
+        ]
+        for name in ("mean", "std", "median"):
+            rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
+        differs = "".join(f", {key}={short(value)}" for key, value in first.differs.items())
+        print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
+        print_table(rows, columns)
+        print()
 
+
+def _seed_label(item: "Comparison", seed: int) -> str:
+    state = item.states[seed].value
+    return str(seed) if state == "finished" else f"{seed} {state}"
+
+
+def _comparison_row(item: "Comparison", seeds: Sequence[int], kind: Format) -> dict[str, Any]:
+    """One spec and metric, as CSV (a column for each seed) or JSON."""
     each = {seed: item.states[seed].value if value is None else value for seed, value in item.values.items()}
     row = {
         "method": item.method,
@@ -250,11 +261,4 @@ def _comparison_row(item: "Comparison", seeds: list[int], kind: Format) -> dict[
     }
     if kind is Format.JSON:
         return {**row, "seeds": each}
-    if kind is Format.CSV:
-        return {**row, **{f"seed_{seed}": each.get(seed) for seed in seeds}}
-    return {
-        **row,
-        "differs": " ".join(f"{key}={short(value)}" for key, value in item.differs.items()),
-        "finished": f"{len(item.known)}/{len(item.values)}",
-        "seeds": "  ".join(f"{seed}: {short(value)}" for seed, value in each.items()),
-    }
+    return {**row, **{f"seed_{seed}": each.get(seed) for seed in seeds}}

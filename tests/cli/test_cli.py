@@ -1,0 +1,183 @@
+"""The command line as a whole: its help, its start-up, and one line for everything that goes wrong."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from ssmail_cli import train
+from ssmail_cli.main import app
+
+from ssmail import __version__
+from ssmail.errors import SsmailError
+from ssmail.store import Store
+from tests.cli.command_line import CommandLine
+
+HEAVY = {"torch", "pandas", "matplotlib", "scipy", "numpy", "sqlalchemy", "yaml"}
+
+
+def commands(command: Any, path: str = "ssmail") -> Iterator[tuple[str, Any]]:
+    yield path, command
+    for name, child in getattr(command, "commands", {}).items():
+        yield from commands(child, f"{path} {name}")
+
+
+COMMANDS = dict(commands(typer.main.get_command(app)))
+
+
+def test_the_commands_are_those_of_the_documentation() -> None:
+    assert {path.removeprefix("ssmail").strip() for path in COMMANDS} == {
+        "",
+        "generate-yjunction",
+        "train",
+        "plot",
+        "runs",
+        "runs list",
+        "runs show",
+        "runs compare",
+        "runs export",
+        "runs delete",
+    }
+
+
+@pytest.mark.parametrize("path", COMMANDS)
+def test_every_command_and_option_has_help(path: str, cli: CommandLine) -> None:
+    command = COMMANDS[path]
+    assert command.help
+    for parameter in command.params:
+        assert getattr(parameter, "help", None), f"{path} {parameter.name} has no help"
+    shown = cli(*path.split()[1:], "--help")
+    assert shown.code == 0
+    for parameter in command.params:
+        for option in parameter.opts:
+            assert option in shown.out or parameter.param_type_name == "argument"
+
+
+def heavy_modules_after(statement: str) -> set[str]:
+    code = f"import sys; {statement}; print(*sys.modules)"
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return HEAVY & set(answer.stdout.split())
+
+
+def test_importing_the_command_line_imports_nothing_heavy() -> None:
+    assert heavy_modules_after("import ssmail_cli.main") == set()
+    assert "yaml" in heavy_modules_after("import ssmail_cli.main, ssmail.experiments")  # the test can fail
+
+
+def test_help_is_quick() -> None:
+    before = os.times()
+    subprocess.run([sys.executable, "-m", "ssmail_cli", "--help"], capture_output=True, check=True)
+    after = os.times()
+    work = after.children_user + after.children_system - before.children_user - before.children_system
+    assert work < 0.4  # seconds of work; on the wall a busy machine takes longer
+
+
+def test_the_version(cli: CommandLine) -> None:
+    assert cli("--version").out == f"ssmail {__version__}\n"
+
+
+def test_without_a_command_the_help_is_shown(cli: CommandLine) -> None:
+    assert cli() == cli("--help")
+    assert "generate-yjunction" in cli().out
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("trian", "no such command 'trian'. Did you mean 'train'?"),
+        ("train --sed 3", "no such option --sed; did you mean --seeds?"),
+        ("train --jobs 0", "greater than or equal to 1"),
+        ("train --resume maybe", "'maybe' is not one of 'auto', 'never', 'require'."),
+        ("train --device gpu", "'gpu' is not one of 'auto', 'cpu', 'cuda'."),
+        ("train --seeds", "option '--seeds' requires an argument."),
+        ("train more", "unexpected extra argument"),
+        ("train --method ssial", "unknown method 'ssial'; did you mean ssail?"),
+        ("train --env yjuncton", "unknown environment 'yjuncton'; did you mean yjunction?"),
+        ("train --profile quik", "unknown profile 'quik'; did you mean quick?"),
+        ("train --set sac.gama=1", "unknown key 'sac.gama' in --set; did you mean sac.gamma?"),
+        ("train --set curriculum.beta=-1", "curriculum.beta = -1 in --set should be greater than or equal to 0."),
+        ("train --set adversarial.alpha_low=2", "alpha_low 2 is above alpha_high 1; swap them."),
+        ("train --db /proc/no/such/place.db", "/proc/no"),
+        ("runs", "missing command."),
+        ("runs lst", "no such command 'lst'. Did you mean 'list'?"),
+        ("runs list --format tabel", "'tabel' is not one of 'table', 'csv', 'json'."),
+        ("plot", "missing argument 'FIGURE...'."),
+        ("plot fig55", "unknown figure 'fig55'; did you mean fig5?"),
+    ],
+)
+def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(cli: CommandLine, line: str, sentence: str) -> None:
+    outcome = cli(*line.split())
+    assert sentence in outcome.sentence
+    assert outcome.code == 2
+
+
+@pytest.mark.parametrize(
+    "line", ["runs list", "runs show a", "runs compare", "runs export", "runs delete a", "plot fig5"]
+)
+def test_reading_needs_a_database_and_makes_none(cli: CommandLine, line: str, tmp_path: Path) -> None:
+    missing = tmp_path / "none.db"
+    outcome = cli(*line.split(), "--db", missing)
+    assert outcome.sentence.startswith(f"there is no database {missing}; `ssmail train --method ssail")
+    assert outcome.code == 2
+    assert not missing.exists()
+
+
+def test_the_database_may_be_named_by_the_environment(
+    cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSMAIL_DB", str(tmp_path / "mine.db"))
+    assert str(tmp_path / "mine.db") in cli("runs", "list").sentence
+    Store.open(tmp_path / "mine.db").close()
+    assert cli("runs", "list").code == 0
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "sentence"),
+    [
+        (
+            RuntimeError("first\nsecond"),
+            1,
+            "unexpected RuntimeError: first second (SSMAIL_DEBUG=1 shows the traceback)",
+        ),
+        (SsmailError("the disk is full"), 1, "the disk is full"),
+    ],
+)
+def test_whatever_fails_is_one_line(
+    cli: CommandLine, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int, sentence: str
+) -> None:
+    def fail(_: str) -> list[int]:
+        raise error
+
+    monkeypatch.setattr(train, "parse_seeds", fail)
+    outcome = cli("train")
+    assert (outcome.code, outcome.err) == (code, f"ssmail: {sentence}\n")
+
+
+def test_ctrl_c_ends_with_its_own_exit_code(cli: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(_: str) -> list[int]:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train, "parse_seeds", interrupt)
+    assert cli("train").code == 130
+
+
+def test_a_developer_gets_the_traceback(cli: CommandLine, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SSMAIL_DEBUG", "1")
+    monkeypatch.setattr(train, "parse_seeds", lambda _: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli("train")
+
+
+def test_a_reader_that_stops_early_is_no_error(tmp_path: Path) -> None:
+    Store.open(tmp_path / "ssmail.db").close()
+    command = [sys.executable, "-m", "ssmail_cli", "runs", "list", "--db", str(tmp_path / "ssmail.db")]
+    reading, writing = os.pipe()
+    os.close(reading)
+    with os.fdopen(writing, "w") as closed:
+        process = subprocess.run(command, stdout=closed, stderr=subprocess.PIPE, text=True, check=False)
+    assert "roken pipe" not in process.stderr
+    assert "Traceback" not in process.stderr

@@ -1,0 +1,230 @@
+"""`ssmail runs`: what is stored, listed, compared, exported and deleted."""
+
+import csv
+import io
+import json
+import math
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ssmail_cli.results import KEY_METRICS
+
+from ssmail.experiments import build_spec
+from ssmail.store import RunState, Store
+from tests.cli.command_line import CommandLine
+
+ERRORS = {0: 0.004, 1: 0.006, 2: 0.011}
+AddRun = Callable[..., str]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store.open(tmp_path / "ssmail.db")
+
+
+@pytest.fixture
+def add(store: Store) -> AddRun:
+    """add(seed, error, *overrides, state=...) -> id of a run of three epochs."""
+
+    def add_run(seed: int, error: float, *overrides: str, state: RunState = RunState.FINISHED) -> str:
+        spec = build_spec("ssail", "yjunction", "smoke", overrides)
+        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
+        for epoch in (1, 2, 3):
+            writer.epoch(epoch, {"validation/mode_mse": error * epoch, "critic/loss": math.inf if epoch == 2 else 0.5})
+        if state is RunState.FINISHED:
+            writer.final(3, dict.fromkeys(KEY_METRICS, error))
+        if state is not RunState.RUNNING:
+            writer.finish(state, None if state is RunState.FINISHED else f"it {state}")
+        return writer.run_id
+
+    return add_run
+
+
+@pytest.fixture
+def filled(add: AddRun) -> dict[str, str]:
+    """Three seeds of one spec, and of another one finished and one diverged seed."""
+    ids = {f"plain {seed}": add(seed, error) for seed, error in ERRORS.items()}
+    ids["other 0"] = add(0, 0.1, "sac.gamma=0.5")
+    ids["other 1"] = add(1, 0.2, "sac.gamma=0.5", state=RunState.DIVERGED)
+    return ids
+
+
+@pytest.fixture
+def runs(cli: CommandLine, store: Store) -> CommandLine:
+    """runs("list", ...) on the store."""
+    return lambda command, *arguments: cli("runs", command, *arguments, "--db", store.where)
+
+
+def read_csv(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def test_without_a_terminal_a_list_is_csv_with_every_column(runs: CommandLine, filled: dict[str, str]) -> None:
+    rows = read_csv(runs("list").out)
+    assert [row["id"] for row in rows] == list(filled.values())  # newest last
+    assert rows[1]["test/mode_mse"] == "0.006"
+    assert rows[4]["state"] == "diverged"
+    assert rows[4]["test/mode_mse"] == ""
+    assert {"git_commit", "host", "wall_seconds", "dataset_hash"} <= rows[0].keys()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ([], ["plain 0", "plain 1", "plain 2", "other 0", "other 1"]),
+        (["--state", "diverged"], ["other 1"]),
+        (["--method", "ssail", "--env", "yjunction", "--profile", "smoke"], None),
+        (["--figure", "fig5", "--state", "finished"], ["plain 0", "plain 1", "plain 2", "other 0"]),
+        (["--figure", "modes", "--state", "finished"], ["plain 0", "plain 1", "plain 2", "other 0"]),
+        (["--method", "gail"], []),
+        (["--env", "mocap"], []),
+        (["--profile", "quick"], []),
+    ],
+)
+def test_filters(runs: CommandLine, filled: dict[str, str], options: list[str], expected: list[str] | None) -> None:
+    names = {run_id: name for name, run_id in filled.items()}
+    outcome = runs("list", "--json", *options)
+    assert outcome.code == 0
+    found = [names[row["id"]] for row in json.loads(outcome.out)]
+    assert found == (list(filled) if expected is None else expected)
+    assert ("no run" in outcome.err) == (not found)
+
+
+def test_runs_are_named_by_their_first_digits(runs: CommandLine, filled: dict[str, str]) -> None:
+    wanted = [filled["plain 2"], filled["other 0"]]
+    rows = json.loads(runs("list", *(run_id[:10] for run_id in wanted), "--json").out)
+    assert [row["id"] for row in rows] == wanted
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["list", "--state", "finishd"], "unknown state 'finishd'; did you mean finished?"),
+        (["list", "--figure", "figg4"], "unknown figure 'figg4'; did you mean fig4?"),
+        (["show", "zzzz"], "no run has an id that begins with 'zzzz'"),
+        (["compare", "--metric", "test/nothing"], "no run compared here has a metric 'test/nothing'"),
+        (["export", "--format", "table"], "an export is csv or json, not a table"),
+        (["export", "--out", "/proc/none.csv"], "/proc/none.csv cannot be written"),
+    ],
+)
+def test_bad_input(runs: CommandLine, filled: dict[str, str], arguments: list[str], sentence: str) -> None:
+    outcome = runs(*arguments)
+    assert sentence in outcome.sentence
+    assert outcome.code == 2
+
+
+def test_a_table_has_short_ids_and_fits_80_columns(
+    runs: CommandLine, filled: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = runs("list", "--format", "table").out.splitlines()
+    assert len(lines) == 1 + len(filled)  # nothing is folded
+    assert max(map(len, lines)) <= 80
+    assert filled["plain 1"][:8] in lines[2]
+    assert filled["plain 1"][:9] not in lines[2]
+    assert "0.006" in lines[2]
+
+
+def test_show_tells_everything(runs: CommandLine, filled: dict[str, str]) -> None:
+    shown = json.loads(runs("show", filled["plain 1"][:8], "--json").out)
+    assert shown["run"]["id"] == filled["plain 1"]
+    assert shown["spec"]["sac"]["gamma"] == build_spec("ssail", "yjunction", "smoke").sac.gamma
+    values = {metric["name"]: metric["value"] for metric in shown["metrics"]}
+    assert values["test/on_lane"] == 0.006
+    rows = {(row["section"], row["name"]): row["value"] for row in read_csv(runs("show", filled["plain 1"]).out)}
+    assert rows["run", "seed"] == "1"
+    assert float(rows["spec", "sac.gamma"]) == shown["spec"]["sac"]["gamma"]
+    assert rows["metric", "validation/mode_mse"] == str(3 * 0.006)
+
+
+def test_compare_groups_by_everything_but_the_seed(runs: CommandLine, filled: dict[str, str]) -> None:
+    found = json.loads(runs("compare", "--json", "--metric", "test/mode_mse").out)
+    plain, other = found
+    assert plain["mean"] == pytest.approx(0.007)
+    assert plain["std"] == pytest.approx(statistics.stdev(ERRORS.values()))
+    assert plain["median"] == 0.006
+    assert plain["seeds"] == {"0": 0.004, "1": 0.006, "2": 0.011}
+    assert (plain["runs"], plain["values"]) == (3, 3)
+    assert other["seeds"] == {"0": 0.1, "1": "diverged"}  # counted and shown, never left out
+    assert (other["runs"], other["values"], other["std"]) == (2, 1, None)
+    assert list(other["differs"]) == ["sac.gamma"]
+    assert other["differs"]["sac.gamma"] == 0.5
+
+
+def test_compare_takes_the_newest_run_of_a_seed(runs: CommandLine, filled: dict[str, str], add: AddRun) -> None:
+    add(1, 0.5)
+    (plain,) = json.loads(runs("compare", "--json", "--metric", "test/mode_mse").out)[:1]
+    assert plain["seeds"] == {"0": 0.004, "1": 0.5, "2": 0.011}
+
+
+def test_compare_has_sensible_metrics_and_a_column_for_each_seed(runs: CommandLine, filled: dict[str, str]) -> None:
+    rows = read_csv(runs("compare").out)
+    assert [row["metric"] for row in rows] == [*KEY_METRICS, *KEY_METRICS]
+    assert (rows[0]["seed_0"], rows[0]["seed_2"]) == ("0.004", "0.011")
+    assert (rows[-1]["seed_1"], rows[-1]["seed_2"]) == ("diverged", "")
+
+
+def test_the_comparison_table_shows_seeds_and_states(
+    runs: CommandLine, filled: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    table = runs("compare", "--format", "table").out
+    assert max(map(len, table.splitlines())) <= 80
+    assert "sac.gamma=0.5" in table
+    assert "1 diverged" in table
+    (median,) = {line.split()[1] for line in table.splitlines() if line.startswith("median")} - {"0.1"}
+    assert median == "0.006"
+
+
+def test_export_writes_every_value(runs: CommandLine, filled: dict[str, str], tmp_path: Path) -> None:
+    rows = read_csv(runs("export").out)
+    assert len(rows) == 5 * 6 + 4 * len(KEY_METRICS)
+    (infinite,) = (r for r in rows if (r["run_id"], r["name"], r["step"]) == (filled["plain 0"], "critic/loss", "2"))
+    assert infinite["value"] == "inf"
+    outcome = runs("export", filled["other 1"], "--json", "--out", tmp_path / "new" / "runs.json")
+    assert outcome.out == ""
+    (exported,) = json.loads((tmp_path / "new" / "runs.json").read_text())
+    assert exported["spec"]["sac"]["gamma"] == 0.5
+    values: list[Any] = [m["value"] for m in exported["metrics"] if m["name"] == "critic/loss"]
+    assert values == [0.5, "inf", 0.5]
+
+
+def test_an_export_reads_back_to_the_same_numbers(runs: CommandLine, filled: dict[str, str], store: Store) -> None:
+    exported = {(row["run_id"], row["name"], row["step"]): float(row["value"]) for row in read_csv(runs("export").out)}
+    frame = store.metrics(list(filled.values()))
+    keys = zip(frame["run_id"], frame["name"], frame["step"].astype(str), strict=True)
+    assert exported == dict(zip(keys, frame["value"], strict=True))
+
+
+def test_delete_asks_first(
+    runs: CommandLine, filled: dict[str, str], store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run_id = filled["other 1"]
+    assert "give --yes to delete " + run_id[:8] in runs("delete", run_id).sentence
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.confirm", lambda *_, **__: False)
+    assert runs("delete", run_id).code == 1
+    assert len(store.runs()) == 5
+    monkeypatch.setattr("typer.confirm", lambda *_, **__: True)
+    assert runs("delete", run_id[:8]).code == 0
+    assert run_id not in [run.id for run in store.runs()]
+    assert runs("delete", filled["other 0"], filled["plain 0"], "--yes").code == 0
+    assert [run.id for run in store.runs()] == [filled["plain 1"], filled["plain 2"]]
+
+
+def test_a_run_that_is_being_computed_is_not_deleted(runs: CommandLine, add: AddRun, store: Store) -> None:
+    run_id = add(0, 0.1, state=RunState.RUNNING)
+    outcome = runs("delete", run_id, "--yes")
+    assert outcome.code == 2
+    assert "being computed" in outcome.sentence
+    assert [run.id for run in store.runs()] == [run_id]
+
+
+def test_an_empty_store_has_an_empty_list(runs: CommandLine, store: Store) -> None:
+    for command in ("list", "compare"):
+        outcome = runs(command, "--json")
+        assert (outcome.code, json.loads(outcome.out)) == (0, [])
+        assert "no run in" in outcome.err
