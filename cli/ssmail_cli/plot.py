@@ -39,10 +39,14 @@ def plot(
     """
     from ssmail.experiments import unknown_name
     from ssmail.figures import FIGURES, save
+    from ssmail.figures.provenance import FORMATS
 
     for name in figures:
         if name not in FIGURES:
             raise unknown_name("figure", name, FIGURES)
+    for form in formats or []:
+        if form not in FORMATS:
+            raise unknown_name("figure format", form, FORMATS)
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
     store = open_store(db)
     for name in dict.fromkeys(FIGURES[name].name for name in figures):

@@ -38,7 +38,7 @@ class Comparison:
     @property
     def mean(self) -> float | None:
         """Mean of the known values; None without one, NaN or infinite when one of them is."""
-        return math.fsum(self.known) / len(self.known) if self.known else None
+        return sum(self.known) / len(self.known) if self.known else None
 
     @property
     def std(self) -> float | None:

@@ -1,0 +1,119 @@
+"""`ssmail generate-yjunction` and `ssmail plot`."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ssmail.data import expert_file, yjunction
+from ssmail.experiments import build_spec
+from ssmail.figures import FIGURES, provenance
+from ssmail.store import RunState, Store
+from tests.cli.command_line import CommandLine
+from tests.figures.handmade_arrays import arrays
+
+
+@pytest.fixture
+def db(tmp_path: Path) -> Path:
+    """A database with one finished run."""
+    store = Store.open(tmp_path / "ssmail.db")
+    writer = store.start_run(build_spec("ssail", "yjunction", "smoke"), 0, dataset_hash="d" * 64, device="cpu")
+    for epoch in (1, 2, 3):
+        writer.epoch(epoch, {"train/mode_mse": 0.1 / epoch})
+    writer.arrays(arrays(0.0))
+    writer.final(3, {"test/on_lane": 0.9, "test/lane_balance": 0.25, "test_constant_velocity/mode_mse": 0.045})
+    writer.finish(RunState.FINISHED)
+    return tmp_path / "ssmail.db"
+
+
+def test_the_default_set_is_that_of_experiments_yaml(cli: CommandLine, tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "set.npz"
+    outcome = cli("generate-yjunction", "--out", out)
+    assert outcome.code == 0
+    params = build_spec("ssail", "yjunction", "quick").data.yjunction
+    experts = expert_file.load(out)
+    assert experts.hash == yjunction.generate(params).hash
+    assert experts.hash[:16] in outcome.out
+    assert f"{params.train}/{params.validation}/{params.test}" in outcome.out
+
+
+def test_every_option_reaches_the_generator(cli: CommandLine, tmp_path: Path) -> None:
+    wanted = {
+        "train": 3,
+        "validation": 4,
+        "test": 5,
+        "agents": 2,
+        "steps": 60,
+        "lane_angle": 20.0,
+        "jitter": 0.5,
+        "seed": 7,
+    }
+    options = [part for key, value in wanted.items() for part in (f"--{key.replace('_', '-')}", value)]
+    outcome = cli("generate-yjunction", "--out", tmp_path / "set.npz", "--json", *options)
+    told = json.loads(outcome.out)
+    assert told["parameters"] == wanted
+    assert told["hash"] == expert_file.load(tmp_path / "set.npz").hash
+
+
+def test_a_file_is_overwritten_only_with_force(cli: CommandLine, tmp_path: Path) -> None:
+    out = tmp_path / "set.npz"
+    small = ("generate-yjunction", "--out", out, "--train", 4, "--validation", 4, "--test", 4)
+    cli(*small)
+    before = out.read_bytes()
+    refused = cli(*small, "--seed", 1)
+    assert refused.code == 2
+    assert refused.sentence.startswith(f"{out} exists already")
+    assert out.read_bytes() == before
+    assert cli(*small, "--seed", 1, "--force").code == 0
+    assert expert_file.load(out).parameters["seed"] == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ("--lane-angle 90", "data.yjunction.lane_angle = 90.0 in the options should be less than 90."),
+        ("--train 0", "data.yjunction.train = 0 in the options should be greater than or equal to 1."),
+        ("--jitter -1", "data.yjunction.jitter = -1.0 in the options should be greater than or equal to 0."),
+        ("--agents 60", "60 agents"),
+        ("--agents two", "'--agents'"),
+        ("--out /proc/none/set.npz", "cannot write /proc/none/set.npz"),
+    ],
+)
+def test_bad_input(cli: CommandLine, tmp_path: Path, options: str, sentence: str) -> None:
+    outcome = cli("generate-yjunction", "--out", tmp_path / "set.npz", *options.split())
+    assert sentence in outcome.sentence
+    assert outcome.code == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_figures_are_written_in_every_format_with_their_runs(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    out = tmp_path / "figures"
+    outcome = cli("plot", "fig4", "modes", "fig4", "--format", "png", "--format", "svg", "--out", out, "--db", db)
+    paths = [Path(line) for line in outcome.out.splitlines()]
+    assert [path.name for path in paths] == [
+        f"{FIGURES[name].stem}{suffix}" for name in ("fig4", "fig5") for suffix in (".png", ".svg", ".csv")
+    ]
+    (run,) = Store.open(db).runs()
+    assert provenance.read(paths[0]).run_ids == (run.id,)
+    assert "fig4: ssail: spec" in outcome.err
+
+
+def test_runs_can_be_chosen(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    (run,) = Store.open(db).runs()
+    chosen = cli("plot", "fig4", "--runs", run.id[:8], "--out", tmp_path / "figures", "--db", db)
+    assert chosen.code == 0
+    twice = cli("plot", "fig4", "--runs", f"{run.id[:8]},zzzz", "--out", tmp_path / "figures", "--db", db)
+    assert "'zzzz'" in twice.sentence
+
+
+def test_a_figure_without_runs_names_the_command_that_makes_them(cli: CommandLine, tmp_path: Path) -> None:
+    Store.open(tmp_path / "empty.db").close()
+    outcome = cli("plot", "fig5", "--db", tmp_path / "empty.db")
+    assert outcome.code == 2
+    assert "ssmail train --method ssail --env yjunction" in outcome.sentence
+
+
+def test_an_unknown_format(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    outcome = cli("plot", "fig4", "--format", "jpg", "--out", tmp_path / "figures", "--db", db)
+    assert outcome.code == 2
+    assert outcome.sentence == "unknown figure format 'jpg'; did you mean png?"

@@ -1,0 +1,237 @@
+"""`ssmail train`: seeds, plans, what it shows and how it ends. Training itself is faked but for one real run."""
+
+import csv
+import io
+import json
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from ssmail_cli.train import MOST_SEEDS, parse_seeds
+
+from ssmail.errors import InputError
+from ssmail.execution import local
+from ssmail.execution.local import Cell, Event, Resume
+from ssmail.store import RunState, Store
+from tests.cli.command_line import CommandLine
+
+SMOKE = ("train", "--profile", "smoke", "--device", "cpu")
+
+
+@pytest.fixture
+def db(tmp_path: Path) -> Path:
+    return tmp_path / "results" / "ssmail.db"
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+    """fake({seed: kind}) puts another run_cells in place, which ends each seed so ("finished" unless said otherwise).
+
+    It returns the arguments that run_cells is going to get.
+    """
+
+    def install(ends: dict[int, str] | None = None) -> dict[str, Any]:
+        arguments: dict[str, Any] = {}
+
+        def run_cells(cells: Sequence[Cell], **options: Any) -> list[Event]:
+            arguments.update(options, seeds=[cell.seed for cell in cells], spec=cells[0].spec)
+            return [end(cell, (ends or {}).get(cell.seed, "finished"), options) for cell in cells]
+
+        monkeypatch.setattr(local, "run_cells", run_cells)
+        return arguments
+
+    def end(cell: Cell, kind: Any, options: dict[str, Any]) -> Event:
+        store, report, epochs = Store.open(options["store_url"]), options["on_event"], cell.spec.training.epochs
+        writer = store.start_run(cell.spec, cell.seed, dataset_hash=None, device="cpu", replace=True)
+        report(Event("started", cell, writer.run_id, 0, epochs))
+        for epoch in range(1, epochs + 1):
+            metrics = {"validation/mode_mse": 0.1 / epoch, "critic/loss": 0.5}
+            writer.epoch(epoch, metrics)
+            report(Event("epoch", cell, writer.run_id, epoch, epochs, metrics))
+        if kind == "finished":
+            writer.final(epochs, {"test/mode_mse": 0.001 * (1 + cell.seed)})
+        writer.finish(RunState(kind), None if kind == "finished" else "the reason")
+        last = Event(kind, cell, writer.run_id, epochs, epochs, {"test/mode_mse": 0.5}, message="the reason")
+        report(last)
+        return last
+
+    return install
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"),
+    [
+        ("0-4", [0, 1, 2, 3, 4]),
+        ("0,2,5", [0, 2, 5]),
+        ("0-2,7", [0, 1, 2, 7]),
+        ("3", [3]),
+        ("7,0-1", [7, 0, 1]),
+        ("1,0-2, 1", [1, 0, 2]),
+        ("5-5", [5]),
+    ],
+)
+def test_seeds(text: str, seeds: list[int]) -> None:
+    assert parse_seeds(text) == seeds
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a", "1-", "-1", "1--2", "0,,1", "4-0", "1.5", f"0-{MOST_SEEDS}", str(2**31), "٣-x"]
+)
+def test_seeds_that_are_none(text: str) -> None:
+    with pytest.raises(InputError, match="--seeds"):
+        parse_seeds(text)
+
+
+def test_the_options_reach_the_training(cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path) -> None:
+    given = fake()
+    more = (
+        "--seeds",
+        "3,1",
+        "--jobs",
+        "2",
+        "--resume",
+        "never",
+        "--set",
+        "sac.gamma=0.5",
+        "--set",
+        "training.epochs=4",
+    )
+    assert cli(*SMOKE, *more, "--db", db).code == 0
+    assert given["seeds"] == [3, 1]
+    assert given["jobs"] == 2
+    assert given["device"] == "cpu"
+    assert given["resume"] is Resume.NEVER
+    assert Path(given["store_url"].removeprefix("sqlite:///")) == db
+    assert (given["spec"].sac.gamma, given["spec"].training.epochs) == (0.5, 4)
+
+
+def test_results_are_rows_in_the_order_of_the_seeds(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
+) -> None:
+    fake()
+    outcome = cli(*SMOKE, "--seeds", "2,0", "--db", db)
+    rows = list(csv.DictReader(io.StringIO(outcome.out)))
+    assert [(row["seed"], row["outcome"], row["test/mode_mse"]) for row in rows] == [
+        ("2", "finished", "0.003"),
+        ("0", "finished", "0.001"),
+    ]
+    found = json.loads(cli(*SMOKE, "--seeds", "5", "--db", db, "--json").out)
+    assert [(row["seed"], row["test/mode_mse"], row["test/on_lane"]) for row in found] == [(5, 0.006, None)]
+
+
+def test_without_a_terminal_progress_is_a_few_lines(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
+) -> None:
+    fake()
+    lines = cli(*SMOKE, "--set", "training.epochs=100", "--db", db).err.splitlines()
+    assert lines[0].startswith("seed 0: started (run ")
+    assert lines[1] == "seed 0: epoch 10/100  val 0.01  critic 0.5"
+    assert lines[-1].startswith("seed 0: finished (run ")
+    assert len(lines) == 12
+
+
+def test_on_a_terminal_there_is_a_line_for_each_seed(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake({1: "failed"})
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    outcome = cli(*SMOKE, "--seeds", "0-1", "--db", db)
+    assert outcome.code == 3
+    assert "seed 0 " in outcome.err
+    assert "3/3 finished (run " in outcome.err
+    assert "3/3 failed (run " in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("ends", "code", "words"),
+    [
+        ({}, 0, ""),
+        ({1: "failed"}, 3, "seed 1 failed: the reason"),
+        ({0: "diverged"}, 3, "seed 0 diverged: the reason"),
+        ({1: "interrupted"}, 130, "the same command continues"),
+        ({0: "failed", 1: "interrupted"}, 130, "the same command continues"),
+    ],
+)
+def test_exit_codes(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, ends: dict[int, str], code: int, words: str
+) -> None:
+    fake(ends)
+    outcome = cli(*SMOKE, "--seeds", "0-1", "--db", db)
+    assert outcome.code == code
+    assert words in outcome.err.splitlines()[-1]
+    assert len(outcome.out.splitlines()) == 3  # the results that there are are shown all the same
+
+
+def test_a_diverged_run_is_skipped_but_is_no_success(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = local.run_cells
+    fake({0: "diverged"})
+    cli(*SMOKE, "--db", db)
+    monkeypatch.setattr(local, "run_cells", real)
+    outcome = cli(*SMOKE, "--db", db)
+    assert "seed 0: skipped: diverged already" in outcome.err
+    assert outcome.code == 3
+
+
+def test_a_dry_run_tells_what_would_run_and_makes_nothing(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
+) -> None:
+    def plan(*options: str) -> list[tuple[str, str]]:
+        outcome = cli(*SMOKE, "--seeds", "0-2", "--dry-run", "--db", db, *options)
+        assert outcome.code == 0
+        return [(row["seed"], row["action"]) for row in csv.DictReader(io.StringIO(outcome.out))]
+
+    assert plan() == [("0", "new"), ("1", "new"), ("2", "new")]
+    assert not db.parent.exists()
+    fake({1: "interrupted"})
+    cli(*SMOKE, "--seeds", "0-1", "--db", db)
+    before = len(Store.open(db).runs())
+    assert plan() == [("0", "skip"), ("1", "resume"), ("2", "new")]
+    assert plan("--resume", "never") == [("0", "new"), ("1", "new"), ("2", "new")]
+    assert plan("--set", "sac.gamma=0.5") == [("0", "new"), ("1", "new"), ("2", "new")]
+    assert len(Store.open(db).runs()) == before
+
+
+@pytest.mark.parametrize("options", [[], ["--dry-run"]])
+def test_nothing_to_resume(cli: CommandLine, db: Path, options: list[str]) -> None:
+    outcome = cli(*SMOKE, "--resume", "require", "--db", db, *options)
+    assert outcome.code == 2
+    assert "--resume auto" in outcome.sentence
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
+def test_cuda_without_a_gpu(cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path) -> None:
+    outcome = cli("train", "--profile", "smoke", "--device", "cuda", "--db", db)
+    assert (outcome.code, outcome.sentence) == (
+        2,
+        "--device cuda needs a CUDA GPU and none is found; use --device cpu.",
+    )
+    given = fake()
+    assert cli("train", "--profile", "smoke", "--device", "auto", "--db", db).code == 0
+    assert given["device"] == "cpu"
+
+
+def test_a_data_file_that_does_not_exist(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    outcome = cli(*SMOKE, "--set", f"data.path={tmp_path}/none.npz", "--db", db)
+    assert outcome.code == 2
+    assert f"{tmp_path}/none.npz" in outcome.sentence
+
+
+def test_a_real_training_from_the_command_line_to_the_figure(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    outcome = cli(*SMOKE, "--db", db, "--json")
+    assert outcome.code == 0
+    (row,) = json.loads(outcome.out)
+    assert row["outcome"] == "finished"
+    assert 0 < row["test/mode_mse"] < 1
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler  # handed back
+    again = cli(*SMOKE, "--db", db, "--json")
+    assert "seed 0: skipped: finished already" in again.err
+    assert json.loads(again.out)[0]["test/mode_mse"] == row["test/mode_mse"]
+    drawn = cli("plot", "fig5", "--db", db, "--out", tmp_path / "figures")
+    assert [Path(line).suffix for line in drawn.out.splitlines()] == [".png", ".csv"]
