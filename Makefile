@@ -22,7 +22,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 demo: $(INSTALLED)  ## train SS-AIL on the Y-Junction (a few minutes) and draw its figures
 	$(BIN)/ssmail train --method ssail --profile quick --seeds 0
 	$(BIN)/ssmail plot fig5 fig4
-	@echo "Look at results/figures/: fig5.png shows the learned trajectories, fig4.png the error over the epochs."
+	@echo "Now look at results/figures/fig5_modes.png (trajectories over the lanes) and fig4_stability.png (error over epochs)."
 
 test: $(INSTALLED)  ## the tests, without the slow ones
 	$(BIN)/pytest -m "not slow"

@@ -1,0 +1,55 @@
+"""`make bench`: how long the command line, an epoch of training (one thread) and the store take on this machine."""
+
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+from ssmail.experiments import build_spec
+from ssmail.store import Store
+from ssmail.training.loop import TrainingLoop
+
+
+def seconds(work: Callable[[], object], times: int) -> float:
+    """The median of a few runs."""
+    taken = []
+    for _ in range(times):
+        begin = time.perf_counter()
+        work()
+        taken.append(time.perf_counter() - begin)
+    return statistics.median(taken)
+
+
+def help_text() -> float:
+    """`ssmail --help`, a new process."""
+    return seconds(
+        lambda: subprocess.run([sys.executable, "-m", "ssmail_cli", "--help"], capture_output=True, check=True), 7
+    )
+
+
+def epoch() -> float:
+    """One epoch of the profile quick, its evaluations included; the first one is not counted."""
+    loop = TrainingLoop(build_spec("ssail", "yjunction", "quick"), seed=0)
+    loop.run_epoch()
+    return seconds(loop.run_epoch, 5)
+
+
+def stored_epoch() -> float:
+    """Writing the 25 metrics of an epoch into SQLite."""
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store.open(Path(folder) / "ssmail.db")
+        writer = store.start_run(build_spec("ssail", "yjunction", "quick"), 0, dataset_hash=None, device="cpu")
+        steps = iter(range(1, 1000))
+        metrics = {f"metric/{number}": float(number) for number in range(25)}
+        return seconds(lambda: writer.epoch(next(steps), metrics), 200)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    for name, measure in (("ssmail --help", help_text), ("epoch (quick)", epoch), ("stored epoch", stored_epoch)):
+        print(f"{name:<16}{measure():9.4f} s", flush=True)
