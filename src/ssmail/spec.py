@@ -139,6 +139,8 @@ class EvaluationSpec(Frozen):
 
     train_rollouts: Count  # training starts rolled out for the training metrics of an epoch
     samples: Count  # rollouts for each test start
+    # an epoch whose validation lane_balance is below is best only while none reaches it
+    least_balance: Annotated[float, Field(ge=0, le=0.5)]
 
 
 class RunSpec(Frozen):

@@ -118,3 +118,16 @@ def test_a_network_reads_time_and_start_only_when_told(spec: RunSpec) -> None:
             made = build_spec("ssail", "yjunction", "smoke", [f"model.time_input={time}", f"model.start_input={start}"])
             sizes[time, start] = TrainingLoop(made, 0).features.size(4)
     assert sizes == {("true", "true"): 9, ("true", "false"): 5, ("false", "true"): 8, ("false", "false"): 4}
+
+
+def test_the_best_model_uses_every_mode_if_one_does(spec: RunSpec) -> None:
+    loop = TrainingLoop(spec, 0)
+    kept = []
+    for loop.epoch, (error, balance) in enumerate(
+        [(0.02, 0.0), (0.03, 0.0), (0.05, 0.4), (0.01, 0.1), (0.04, 0.3), (0.06, 0.5)], 1
+    ):
+        loop._select(error, balance)
+        kept.append((loop.improved, loop.best_epoch))
+    assert kept == [(True, 1), (False, 1), (True, 3), (False, 3), (True, 5), (False, 5)]
+    loop._select(math.nan, 0.5)
+    assert not loop.improved

@@ -76,7 +76,7 @@ class AdversarialLearner:
         return self.average if self.spec.training.policy_average > 0 else self.policy
 
     def set_learning_rates(self, decayed: float) -> None:
-        """Put the learning rates at the fraction `decayed` (0 .. 1) of the way from their first to their final values."""
+        """Put the learning rates at the fraction `decayed` (0 .. 1) of the way from first to final values."""
         for name, optimizer in self.optimizers.items():
             factor = 1 - decayed * (1 - self.final_factors[name])
             optimizer.param_groups[0]["lr"] = factor * self.first_rates[name]

@@ -56,6 +56,7 @@ class TrainingLoop:
         self.replay = Replay(spec.training.replay)
         self.epoch = 0
         self.improved = False
+        self.best_neglects = True
         self.best_error = math.inf
         self.best_epoch = 0
         self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
@@ -76,12 +77,19 @@ class TrainingLoop:
         values |= {"curriculum/intervention_frequency": frequency, "curriculum/segment_length": segment}
         values |= self._validate()
         self.epoch += 1
-        error = values["validation/mode_mse"]
-        self.improved = error < self.best_error
-        if self.improved:
-            self.best_error, self.best_epoch = error, self.epoch
-            self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
+        self._select(values["validation/mode_mse"], values["validation/lane_balance"])
         return values | {"seconds": time.perf_counter() - began}
+
+    def _select(self, error: float, balance: float) -> None:
+        """Keep this epoch's model if it is the best so far: the smallest error among those that use every mode.
+
+        The error is the distance to the nearest mode, so by itself it would prefer a model that dropped one.
+        """
+        neglects = balance < self.spec.evaluation.least_balance or not math.isfinite(error)
+        self.improved = (neglects, error) < (self.best_neglects, self.best_error)
+        if self.improved:
+            self.best_neglects, self.best_error, self.best_epoch = neglects, error, self.epoch
+            self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Metrics of the best-validation model on the test split (sampled, mean), of the last model, and of constant
@@ -114,7 +122,12 @@ class TrainingLoop:
         """Everything needed to continue as if never interrupted: tensors and plain data only."""
         return {
             "epoch": self.epoch,
-            "best": {"error": self.best_error, "epoch": self.best_epoch, "weights": self.best_weights},
+            "best": {
+                "neglects": self.best_neglects,
+                "error": self.best_error,
+                "epoch": self.best_epoch,
+                "weights": self.best_weights,
+            },
             "learner": self.learner.state_dict(),
             "replay": self.replay.state_dict(),
             "generators": self.generators.state_dict(),
@@ -124,7 +137,8 @@ class TrainingLoop:
         """Inverse of `state_dict`, for a loop made with the same spec and seed."""
         self.epoch = state["epoch"]
         best = state["best"]
-        self.best_error, self.best_epoch, self.best_weights = best["error"], best["epoch"], best["weights"]
+        self.best_neglects, self.best_error = best["neglects"], best["error"]
+        self.best_epoch, self.best_weights = best["epoch"], best["weights"]
         self.learner.load_state_dict(state["learner"])
         self.replay.load_state_dict(state["replay"])
         self.generators.load_state_dict(state["generators"])
