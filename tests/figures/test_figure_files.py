@@ -114,7 +114,7 @@ def test_a_changed_value_changes_every_file(filled: Store, add_run: Any, tmp_pat
 
 def test_the_users_matplotlib_settings_neither_matter_nor_change(filled: Store, tmp_path: Path) -> None:
     plain = saved(filled, "fig4", tmp_path / "plain", ["svg"])
-    with matplotlib.rc_context({"lines.linewidth": 9.0, "font.size": 30.0, "svg.hashsalt": "mine"}):
+    with matplotlib.rc_context({"lines.linewidth": 9.0, "axes.facecolor": "red", "svg.hashsalt": "mine"}):
         mine = dict(matplotlib.rcParams)
         odd = saved(filled, "fig4", tmp_path / "odd", ["svg"])
         assert dict(matplotlib.rcParams) == mine
