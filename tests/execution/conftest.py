@@ -1,0 +1,28 @@
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from ssmail.execution.cells import Cell
+from ssmail.experiments import build_spec
+from ssmail.store import Store
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store.open(tmp_path / "results" / "ssmail.db")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def cells() -> list[Cell]:
+    """Seeds 0, 1 and 2 of a spec of 4 epochs."""
+    spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
+    return [Cell(spec, seed) for seed in (0, 1, 2)]
+
+
+@pytest.fixture(autouse=True)
+def _workers_find_the_fake_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]), prepend=os.pathsep)
