@@ -136,7 +136,7 @@ class _Pool:
             for child in self._children:
                 child.ask_to_stop()
             for child in self._children:
-                child.process.wait()
+                child.wait()
             self._selector.close()
 
     def _start_some(self) -> None:
