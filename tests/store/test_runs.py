@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import sqlite3
-import subprocess
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -16,7 +15,7 @@ import pytest
 from ssmail.errors import InputError, SsmailError
 from ssmail.experiments import build_spec
 from ssmail.spec import RunSpec
-from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive, origin
+from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive
 
 NOT_FINITE = {"nan": math.nan, "up": math.inf, "down": -math.inf}
 
@@ -341,34 +340,3 @@ def test_the_writer_of_a_deleted_run_is_told(store: Store, writer: RunWriter) ->
     store.delete([writer.run_id], stale_seconds=0)
     with pytest.raises(SsmailError, match="was deleted"):
         writer.epoch(1, {"a": 1.0})
-
-
-def test_the_commit_is_that_of_an_ssmail_checkout(tmp_path: Path) -> None:
-    def git(*arguments: str) -> str:
-        identity = ["-c", "user.name=t", "-c", "user.email=t@example.org", "-c", "commit.gpgsign=false"]
-        command = ["git", "-C", str(tmp_path), *identity, *arguments]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-
-    assert origin.git_state(tmp_path) == (None, None)
-    git("init")
-    code = tmp_path / "src" / "ssmail" / "spec.py"
-    code.parent.mkdir(parents=True)
-    code.write_text("a = 1\n")
-    (tmp_path / "experiments.yaml").write_text("")
-    (tmp_path / "cli").mkdir()
-    assert origin.git_state(tmp_path) == (None, None)  # no commit yet
-    git("add", ".")
-    git("commit", "-m", "first")
-    commit = git("rev-parse", "HEAD")
-    assert origin.git_state(tmp_path) == (commit, False)
-    (tmp_path / "notes.txt").write_text("not code")
-    assert origin.git_state(tmp_path) == (commit, False)
-    (tmp_path / "src" / "ssmail" / "new.py").write_text("")
-    assert origin.git_state(tmp_path) == (commit, True)
-
-
-def test_another_repository_around_an_installed_ssmail_is_not_its_checkout(tmp_path: Path) -> None:
-    subprocess.run(["git", "init", str(tmp_path)], check=True, capture_output=True)
-    (tmp_path / "lib" / "ssmail").mkdir(parents=True)
-    assert origin.git_state(tmp_path) == (None, None)
-    assert origin.git_state(tmp_path / "lib") == (None, None)
