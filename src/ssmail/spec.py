@@ -14,6 +14,7 @@ NonNegativeCount = Annotated[int, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 Pairing = Literal["start", "nearest", "assignment"]
@@ -77,11 +78,13 @@ class AdversarialSpec(Frozen):
     alpha_high: Finite
     pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
     learning_rate: Positive
-    learning_rate_final: Fraction  # the last epoch's rate as a fraction of the first's
+    learning_rate_final: Share  # the last epoch's rate as a fraction of the first's
     updates: Count  # discriminator steps for each SAC step
     past_share: (
         Fraction  # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
     )
+    # std of the Gaussian noise on the states and actions that the discriminator is trained on, scaled units
+    input_noise: NonNegative
     reward_scale: Positive
 
     @model_validator(mode="after")
@@ -97,9 +100,9 @@ class SacSpec(Frozen):
     gamma: Annotated[float, Field(ge=0, lt=1)]
     polyak: Annotated[float, Field(gt=0, le=1)]
     actor_learning_rate: Positive
-    actor_learning_rate_final: Fraction  # the last epoch's rate as a fraction of the first's; the temperature's too
+    actor_learning_rate_final: Share  # the last epoch's rate as a fraction of the first's; the temperature's too
     critic_learning_rate: Positive
-    critic_learning_rate_final: Fraction
+    critic_learning_rate_final: Share
     temperature: NonNegative  # the fixed one, or the first one when automatic
     automatic_temperature: bool
     temperature_learning_rate: Positive
@@ -127,7 +130,9 @@ class TrainingSpec(Frozen):
     )
     rollouts: Count  # trajectories generated in each epoch
     replay: Count  # generated trajectories kept
-    decay_start: Fraction  # fraction of the epochs after which the learning rates fall, linearly, to their final values
+    decay_start: (
+        Fraction  # fraction of the epochs after which the learning rates fall, geometrically, to their final values
+    )
     policy_average: Annotated[
         float, Field(ge=0, lt=1)
     ]  # decay of the averaged actor that is evaluated; 0 evaluates the actor itself

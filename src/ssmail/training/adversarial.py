@@ -76,10 +76,9 @@ class AdversarialLearner:
         return self.average if self.spec.training.policy_average > 0 else self.policy
 
     def set_learning_rates(self, decayed: float) -> None:
-        """Put the learning rates at the fraction `decayed` (0 .. 1) of the way from first to final values."""
+        """Put the learning rates at the fraction `decayed` (0 .. 1) of the geometric way from first to final values."""
         for name, optimizer in self.optimizers.items():
-            factor = 1 - decayed * (1 - self.final_factors[name])
-            optimizer.param_groups[0]["lr"] = factor * self.first_rates[name]
+            optimizer.param_groups[0]["lr"] = self.first_rates[name] * self.final_factors[name] ** decayed
 
     def update(self, latest: Batch, replay: Replay) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
@@ -134,11 +133,22 @@ class AdversarialLearner:
         mixed, alpha = self._mixed(generated, self.spec.adversarial.pairing)
         everything = Batch.concatenate([generated, expert, mixed])
         chosen = self._pick_steps(everything.actions.shape[1])
-        outputs = self.discriminator(self._inputs(everything)[:, chosen], everything.actions[:, chosen])
+        x, actions = self._inputs(everything)[:, chosen], everything.actions[:, chosen]
+        outputs = self.discriminator(self._blurred(x, self.experts.states.shape[-1]), self._blurred(actions))
         on_generated, on_expert, on_mixed = outputs.chunk(3)
         loss, terms = ssail_loss(on_generated, on_expert, on_mixed, alpha)
         self._step("discriminator", loss, self.discriminator.parameters())
         return {"discriminator/loss": loss, **{f"discriminator/{k}": v for k, v in terms.items()}}
+
+    def _blurred(self, inputs: Tensor, features: int | None = None) -> Tensor:
+        """`inputs` with Gaussian noise on the first `features` of them (all by default), so that D judges the track,
+        not the jitter.
+        """
+        std = self.spec.adversarial.input_noise
+        if std == 0:
+            return inputs
+        noise = torch.randn(*inputs[..., :features].shape, generator=self.generators["data"]).to(self.device)
+        return torch.cat([inputs[..., :features] + std * noise, inputs[..., noise.shape[-1] :]], dim=-1)
 
     def _update_actor_critic(self, replay: Replay) -> dict[str, Tensor]:
         b = self.spec.training.batch

@@ -158,7 +158,7 @@ class TrainingLoop:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
 
     def _decayed(self) -> float:
-        """0 up to training.decay_start, then linearly to 1 in the last epoch."""
+        """0 up to training.decay_start, then evenly to 1 in the last epoch."""
         training = self.spec.training
         progress = self.epoch / max(training.epochs - 1, 1)
         return max(progress - training.decay_start, 0) / max(1 - training.decay_start, 1e-9)
