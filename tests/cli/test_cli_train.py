@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -145,6 +146,19 @@ def test_on_a_terminal_there_is_a_line_for_each_seed(
     assert "seed 0 " in outcome.err
     assert "3/3 finished (run " in outcome.err
     assert "3/3 failed (run " in outcome.err
+
+
+def test_no_color_is_respected(
+    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    monkeypatch.setenv("TERM", "xterm-256color")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    colour = re.compile(r"\x1b\[[0-9;]*3[0-9]")
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    assert colour.search(cli(*SMOKE, "--db", db).err)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert not colour.search(cli(*SMOKE, "--db", db).err)
 
 
 @pytest.mark.parametrize(
