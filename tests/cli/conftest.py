@@ -1,8 +1,8 @@
 """The command line in this process, free of the developer's settings."""
 
 import pytest
-from ssmail_cli.main import run
 
+from ssmail_cli.main import run
 from tests.cli.command_line import CommandLine, Outcome
 
 SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")

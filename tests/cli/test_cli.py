@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import typer.main
-from ssmail_cli import train
-from ssmail_cli.main import app
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
 from ssmail.store import Store
+from ssmail_cli import train
+from ssmail_cli.main import app
 from tests.cli.command_line import CommandLine
 
 HEAVY = {"torch", "pandas", "matplotlib", "scipy", "numpy", "sqlalchemy", "yaml"}

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ssmail_cli.results import KEY_METRICS
 
 from ssmail.experiments import build_spec
 from ssmail.store import RunState, Store
+from ssmail_cli.results import KEY_METRICS
 from tests.cli.command_line import CommandLine
 
 ERRORS = {0: 0.004, 1: 0.006, 2: 0.011}

@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 import torch
-from ssmail_cli.train import MOST_SEEDS, parse_seeds
 
 from ssmail.errors import InputError
 from ssmail.execution import local
 from ssmail.execution.local import Cell, Event, Resume
 from ssmail.store import RunState, Store
+from ssmail_cli.train import MOST_SEEDS, parse_seeds
 from tests.cli.command_line import CommandLine
 
 SMOKE = ("train", "--profile", "smoke", "--device", "cpu")

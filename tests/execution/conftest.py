@@ -18,9 +18,9 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 @pytest.fixture
 def cells() -> list[Cell]:
-    """Seeds 0, 1 and 2 of a spec of 4 epochs."""
+    """Seeds 0 to 3 of a spec of 4 epochs."""
     spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
-    return [Cell(spec, seed) for seed in (0, 1, 2)]
+    return [Cell(spec, seed) for seed in range(4)]
 
 
 @pytest.fixture(autouse=True)

@@ -67,6 +67,18 @@ class Crashes(Walk):
         return super().run_epoch()
 
 
+class Accidents(Crashes):
+    """In their second epochs seed 2 is killed, as by the kernel for want of memory, and seed 3 just leaves."""
+
+    def run_epoch(self) -> dict[str, float]:
+        if self.epoch == 1 and self.seed == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if self.epoch == 1 and self.seed == 3:
+            print("out of luck", file=sys.stderr, flush=True)
+            os._exit(7)
+        return super().run_epoch()
+
+
 class Diverges(Walk):
     """In its third epoch."""
 
@@ -101,15 +113,6 @@ class Endless(Walk):
         return super().run_epoch()
 
 
-class Killed(Walk):
-    """Seed 1 is killed in its second epoch, as by the kernel when memory runs out."""
-
-    def run_epoch(self) -> dict[str, float]:
-        if self.epoch == 1 and self.seed == 1:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return super().run_epoch()
-
-
 class Chatty(Walk):
     """Prints where the events go, says how many threads it has, and whether it meets the process of the other seed."""
 
@@ -124,11 +127,3 @@ class Chatty(Walk):
         while not (place / f"seed {1 - self.seed}").exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         return (place / f"seed {1 - self.seed}").exists()
-
-
-class Leaves(Walk):
-    """Ends the whole process without a word to Python."""
-
-    def run_epoch(self) -> dict[str, float]:
-        print("out of luck", file=sys.stderr, flush=True)
-        os._exit(7)
