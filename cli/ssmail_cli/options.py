@@ -1,11 +1,12 @@
 """Options that several commands share, and the store they name."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, SsmailError
 from ssmail_cli.display import Format
 
 if TYPE_CHECKING:
@@ -42,13 +43,20 @@ def is_missing(database: str) -> bool:
 
 
 def open_store(database: str) -> "Store":
-    """The store of a command that only reads. Raises InputError when the file is missing: reading must not make one."""
-    from ssmail.store import Store
+    """The store of a command that reads; runs whose process has died are marked interrupted first, where possible.
+
+    Raises InputError when the file is missing: reading must not make one.
+    """
+    from ssmail.store import STALE_SECONDS, Store, is_alive
 
     if is_missing(database):
         command = "ssmail train --method ssail --profile quick --seeds 0-4"
         raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
-    return Store.open(database)
+    store = Store.open(database)
+    if not all(is_alive(row, STALE_SECONDS) for row in store.runs(state="running")):
+        with suppress(SsmailError):
+            store.mark_stale()
+    return store
 
 
 def select_runs(

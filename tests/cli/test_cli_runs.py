@@ -4,8 +4,10 @@ import csv
 import io
 import json
 import math
+import sqlite3
 import statistics
 from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -228,3 +230,13 @@ def test_an_empty_store_has_an_empty_list(runs: CommandLine, store: Store) -> No
         outcome = runs(command, "--json")
         assert (outcome.code, json.loads(outcome.out)) == (0, [])
         assert "no run in" in outcome.err
+
+
+def test_a_run_whose_process_died_is_shown_as_interrupted(runs: CommandLine, store: Store, add: AddRun) -> None:
+    alive, dead = add(0, 0.1, state=RunState.RUNNING), add(1, 0.1, state=RunState.RUNNING)
+    long_ago = (datetime.now(UTC) - timedelta(hours=1)).isoformat(sep=" ")
+    with sqlite3.connect(store.where) as connection:
+        stamp = connection.execute("SELECT heartbeat FROM run WHERE id = ?", (dead,)).fetchone()[0]
+        connection.execute("UPDATE run SET heartbeat = ? WHERE id = ?", (long_ago[: len(stamp)], dead))
+    listed = {row["id"]: row["state"] for row in json.loads(runs("list", "--json").out)}
+    assert listed == {alive: "running", dead: "interrupted"}

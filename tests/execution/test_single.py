@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 
+from ssmail.data.expert_file import save
+from ssmail.data.yjunction import generate
 from ssmail.execution import single
 from ssmail.execution.cells import Cell, Event, Job, Resume, Settings
 from ssmail.execution.single import run_cell
+from ssmail.experiments import build_spec
 from ssmail.store import RunState, RunWriter, Store
 from tests.execution.fake_loop import Walk
 from tests.execution.recorded import recorded
@@ -290,3 +293,16 @@ def test_jobs_and_events_survive_the_way_between_processes(cells: list[Cell]) ->
     event = Event("epoch", cells[2], "abc", 1, 4, {"a": float("inf"), "b": 0.1}, "line\nbreak", True)
     assert Event.from_line(event.as_line(), cells[2]) == event
     assert "\n" not in event.as_line()
+
+
+def test_a_finished_cell_is_skipped_only_while_its_data_file_is_the_same(store: Store, tmp_path: Path) -> None:
+    path = tmp_path / "experts.npz"
+    spec = build_spec("ssail", "yjunction", "smoke", [f"data.path={path}", "training.epochs=1"])
+    save(generate(spec.data.yjunction), path)
+    assert run(Cell(spec, 0), store, Settings())[-1].kind == "finished"
+    assert run(Cell(spec, 0), store, Settings())[-1].kind == "skipped"
+    save(generate(spec.data.yjunction.model_copy(update={"seed": 5})), path, force=True)
+    (refused,) = run(Cell(spec, 0), store, Settings())
+    assert (refused.kind, refused.bad_input) == ("failed", True)
+    assert "has changed since run" in refused.message
+    assert run(Cell(spec, 0), store, Settings(resume=Resume.NEVER))[-1].kind == "finished"

@@ -4,8 +4,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Literal, Self
 
+from ssmail.data.expert_file import load
 from ssmail.errors import InputError
 from ssmail.spec import RunSpec
 from ssmail.store import HEARTBEAT_SECONDS, STALE_SECONDS, RunRow, RunState, Store, is_alive
@@ -111,10 +113,18 @@ class Plan:
     row: RunRow | None = None
 
 
+def _check_data(cell: Cell, row: RunRow) -> None:
+    """Raise InputError when the spec names a data file that is no longer the one of the finished run `row`."""
+    path = cell.spec.data.path
+    if path is not None and load(Path(path)).hash != row.dataset_hash:
+        raise InputError(f"{path} has changed since run {row.name} was trained on it; train afresh with --resume never")
+
+
 def plan_cell(store: Store, cell: Cell, settings: Settings) -> Plan:
     """Decide by what the store holds now.
 
-    Raises InputError when another process is computing the cell, or when REQUIRE finds nothing to resume.
+    Raises InputError when another process is computing the cell, when REQUIRE finds nothing to resume, or when the data
+    file of a finished cell has changed.
     """
     row = store.find_cell(cell.spec.hash(), cell.seed)
     if row is not None and is_alive(row, settings.stale_seconds):
@@ -122,6 +132,7 @@ def plan_cell(store: Store, cell: Cell, settings: Settings) -> Plan:
     if settings.resume is Resume.NEVER:
         return Plan()
     if row is not None and row.state in (RunState.FINISHED, RunState.DIVERGED):
+        _check_data(cell, row)
         epochs = cell.spec.training.epochs
         epoch = epochs if row.state is RunState.FINISHED else 0
         message = f"{row.state} already, as run {row.name}"
