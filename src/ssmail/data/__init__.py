@@ -1,1 +1,1 @@
-""""""
+"""Expert trajectories: made, scaled, saved."""

@@ -1,1 +1,1 @@
-""""""
+"""Environments: what an action does to a state."""

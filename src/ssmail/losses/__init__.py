@@ -1,1 +1,1 @@
-""""""
+"""Losses: pure functions from tensors to a scalar and its terms."""

@@ -1,1 +1,1 @@
-""""""
+"""Training: the learner, rollouts, curricula, replay, and the loop that yields metrics."""

@@ -29,13 +29,8 @@ class AdversarialLearner:
     def __init__(
         self, spec: RunSpec, experts: Batch, features: Features, integrator: Integrator, generators: Generators
     ) -> None:
-        self.spec, self.experts, self.features, self.integrator, self.generators = (
-            spec,
-            experts,
-            features,
-            integrator,
-            generators,
-        )
+        self.spec, self.experts, self.generators = spec, experts, generators
+        self.features, self.integrator = features, integrator
         self.device = experts.states.device
         action_size = experts.actions.shape[-1]
         inputs = features.size(experts.states.shape[-1])
