@@ -1,19 +1,10 @@
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from ssmail.execution.cells import Cell
 from ssmail.experiments import build_spec
-from ssmail.store import Store
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "results" / "ssmail.db")
-    yield opened
-    opened.close()
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """A small hand-made database, written through the store's own API."""
 
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
@@ -12,13 +11,6 @@ from ssmail.store import RunState, Store
 from .handmade_arrays import arrays
 
 AddRun = Callable[..., str]
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "db" / "ssmail.db")
-    yield opened
-    opened.close()
 
 
 @pytest.fixture

@@ -1,18 +1,8 @@
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from ssmail.experiments import build_spec
 from ssmail.spec import RunSpec
 from ssmail.store import RunWriter, Store
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store.open(tmp_path / "results" / "ssmail.db")
-    yield opened
-    opened.close()
 
 
 @pytest.fixture
