@@ -24,7 +24,7 @@ def run_row(run: "RunRow") -> dict[str, Any]:
 
 def rows_with_metrics(store: "Store", runs: "Sequence[RunRow]", names: Sequence[str]) -> list[dict[str, Any]]:
     """A row for each run: its short id as `run`, its columns, and the last value of each named metric or None."""
-    frame = store.latest_metrics([run.id for run in runs], names)
-    keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
-    latest = dict(zip(keys, frame["value"].tolist(), strict=True))
+    from ssmail.store.comparison import latest_values
+
+    latest = latest_values(store, runs, names)
     return [{"run": run.name, **run_row(run)} | {name: latest.get((run.id, name)) for name in names} for run in runs]

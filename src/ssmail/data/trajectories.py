@@ -29,6 +29,11 @@ class Trajectories:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def __getitem__(self, index: Integers) -> "Trajectories":
+        """Those trajectories of which `index` holds the positions in the set."""
+        continuations = self.continuations[:, index]
+        return Trajectories(self.positions[index], self.velocities[index], self.mode[index], continuations)
+
 
 @dataclass(frozen=True)
 class ExpertSet:

@@ -62,14 +62,19 @@ def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> lis
     for run in newest.values():
         specs.setdefault(run.spec_hash, []).append(run)
     differences = _differences({spec: found[0].spec for spec, found in specs.items()})
-    frame = store.latest_metrics([run.id for run in newest.values()], metrics)
-    keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
-    latest: dict[tuple[str, str], float] = dict(zip(keys, frame["value"].tolist(), strict=True))
+    latest = latest_values(store, list(newest.values()), metrics)
     return [
         _comparison(sorted(found, key=lambda run: run.seed), differences[spec], metric, latest)
         for spec, found in specs.items()
         for metric in metrics
     ]
+
+
+def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> dict[tuple[str, str], float]:
+    """The last value of each metric of the runs, by (run id, name); no entry where a run recorded none."""
+    frame = store.latest_metrics([run.id for run in runs], metrics)
+    keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
+    return dict(zip(keys, frame["value"].tolist(), strict=True))
 
 
 def _comparison(

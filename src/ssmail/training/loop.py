@@ -49,6 +49,7 @@ class TrainingLoop:
         self.scaling = self.data.scaling
         self.generators = Generators(seed)
         self.experts = self._scaled(self.data.train)
+        self.validation_start = self._scaled(self.data.validation).states[:, 0]
         self.steps = self.experts.actions.shape[1]
         self.features = Features(spec.model.time_input, spec.model.start_input, self.steps + 1)
         self.integrator = Integrator(self.scaling)
@@ -189,15 +190,9 @@ class TrainingLoop:
     def _validate(self) -> dict[str, float]:
         """Free-running sampled rollouts from every validation start and from some training starts."""
         count = min(self.spec.evaluation.train_rollouts, len(self.data.train))
-        chosen = torch.randperm(len(self.data.train), generator=self.generators["evaluation"])[:count].numpy()
-        train = Trajectories(
-            self.data.train.positions[chosen],
-            self.data.train.velocities[chosen],
-            self.data.train.mode[chosen],
-            self.data.train.continuations[:, chosen],
-        )
-        validation = self.data.validation
-        start = torch.cat([self._scaled(validation).states[:, 0], self._scaled(train).states[:, 0]])
+        chosen = torch.randperm(len(self.data.train), generator=self.generators["evaluation"])[:count]
+        validation, train = self.data.validation, self.data.train[chosen.numpy()]
+        start = torch.cat([self.validation_start, self.experts.states[chosen.to(self.device), 0]])
         positions = self._free_run(self.learner.evaluated_policy(), start)
         values: dict[str, float] = {}
         parts = {
