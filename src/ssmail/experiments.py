@@ -9,13 +9,13 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from ssmail.errors import InputError
-from ssmail.spec import RunSpec
+from ssmail.spec import OPTIONAL_SECTIONS, SECTIONS, RunSpec
 
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
 _FILE_NAME = "experiments.yaml"
@@ -78,6 +78,9 @@ def build_spec(
         _check_keys(given, layer.source)
         origins.update(dict.fromkeys(given, layer.source))
         merged = _merge(merged, layer.values)
+    for text in overrides:
+        _check_section(text.partition(".")[0].strip(), method, source)
+    merged |= {name: None for name in OPTIONAL_SECTIONS if name not in SECTIONS[method]}
     try:
         return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
@@ -209,10 +212,10 @@ def _merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]
 def _spec_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, bool]]:
     """(dotted key, whether it is a section) of every field of a spec."""
     for name, field in model.model_fields.items():
-        section = isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-        yield f"{prefix}{name}", section
+        section = _section(field.annotation)
+        yield f"{prefix}{name}", section is not None
         if section:
-            yield from _spec_keys(field.annotation, f"{prefix}{name}.")  # type: ignore[arg-type]  # checked above
+            yield from _spec_keys(section, f"{prefix}{name}.")
 
 
 def _check_keys(given: Mapping[str, Any], source: str) -> None:
@@ -227,6 +230,21 @@ def _check_keys(given: Mapping[str, Any], source: str) -> None:
             raise InputError(
                 f"{key} = {_shown(value)} in {source} is a section, not a value; set one of its keys such as {first}."
             )
+
+
+def _check_section(section: str, method: str, source: str) -> None:
+    """Raise InputError for a value in a section that the method does not have."""
+    if section in OPTIONAL_SECTIONS and section not in SECTIONS[method]:
+        users = ", ".join(name for name, sections in SECTIONS.items() if section in sections)
+        raise InputError(f"method {method} has no section '{section}' to set in {source}; it belongs to {users}.")
+
+
+def _section(annotation: Any) -> type[BaseModel] | None:
+    """The model of a section, `Section` or `Section | None`; None for a plain value."""
+    for kind in get_args(annotation) or (annotation,):
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            return kind
+    return None
 
 
 def _nearest_key(key: str, known: Mapping[str, bool]) -> str:

@@ -5,7 +5,7 @@ No field has a default here: each default is written once, in experiments.yaml (
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -19,8 +19,22 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 Pairing = Literal["start", "nearest", "assignment"]
 
-METHODS = ("ssail",)
+Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
+METHODS: tuple[str, ...] = get_args(Method)
 ENVIRONMENTS = ("yjunction",)
+
+_GAME = ("model", "adversarial", "sac", "curriculum", "training")
+_VARIATIONAL = ("variational", "cloning", "curriculum", "training")
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "ssail": (*_GAME, "self_supervision"),
+    "gail": _GAME,
+    "wail": (*_GAME, "wasserstein"),
+    "bc": ("model", "cloning", "training"),
+    "nri": _VARIATIONAL,
+    "dnri": _VARIATIONAL,
+    "constant-velocity": (),
+    "copy-last": (),
+}  # the sections that a method has beside data and evaluation; the others are null in its spec
 
 
 class Frozen(BaseModel):
@@ -72,26 +86,45 @@ class ModelSpec(Frozen):
 
 
 class AdversarialSpec(Frozen):
-    """The discriminator's game: Eq. 3, its alpha, and the batches it sees."""
+    """The discriminator's game, whatever its loss: the batches it sees and how it learns."""
+
+    learning_rate: Positive
+    learning_rate_final: Share  # the last epoch's rate as a fraction of the first's
+    beta1: Annotated[float, Field(ge=0, lt=1)]  # of Adam, for the discriminator
+    updates: Count  # discriminator steps for each SAC step
+    rollouts: Count  # trajectories generated in each epoch
+    replay: Count  # generated trajectories kept
+    # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
+    past_share: Fraction
+    # random time steps of each trajectory that an update uses (only the encoder needs whole sequences)
+    time_steps: Count
+    # std of the Gaussian noise on the states and actions that the discriminator is trained on, scaled units
+    input_noise: NonNegative
+    reward_scale: Positive
+
+
+class SelfSupervisionSpec(Frozen):
+    """What Eq. 3 adds to the game: tau_alpha, for the discriminator and for the actor-critic (3.1.1, 3.1.3)."""
 
     alpha_low: Finite
     alpha_high: Finite
     pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
-    learning_rate: Positive
-    learning_rate_final: Share  # the last epoch's rate as a fraction of the first's
-    updates: Count  # discriminator steps for each SAC step
-    past_share: (
-        Fraction  # share of the generated batch drawn from the replay of past tau_G instead of the latest rollouts
-    )
-    # std of the Gaussian noise on the states and actions that the discriminator is trained on, scaled units
-    input_noise: NonNegative
-    reward_scale: Positive
+    actor_pairing: Pairing  # the same in the actor-critic's batches
+    actor_share: Fraction  # share of tau_alpha in an actor-critic batch; the rest is tau_G
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.alpha_low > self.alpha_high:
             raise ValueError(f"alpha_low {self.alpha_low:g} is above alpha_high {self.alpha_high:g}; swap them")
         return self
+
+
+class WassersteinSpec(Frozen):
+    """How wail's critic is kept Lipschitz."""
+
+    constraint: Literal["penalty", "clipping"]
+    penalty: NonNegative  # weight of the gradient penalty (Gulrajani et al. 2017)
+    clip: Positive  # largest absolute weight of the critic with clipping (Arjovsky et al. 2017)
 
 
 class SacSpec(Frozen):
@@ -108,34 +141,52 @@ class SacSpec(Frozen):
     temperature_learning_rate: Positive
     target_entropy: Finite  # nats for each action dimension of one agent, in scaled velocity units
     graph_entropy: NonNegative  # weight of the edge-type distribution's entropy in the actor's objective
-    pairing: Pairing  # which expert trajectory a generated one is mixed with, in the actor-critic's batches
-    mixed_share: Fraction  # share of tau_alpha in a SAC batch; the rest is tau_G
+
+
+class VariationalSpec(Frozen):
+    """Sizes and terms of nri and dnri (Kipf et al. 2018; Graber and Schwing 2020)."""
+
+    hidden: Count  # of the encoder's perceptrons
+    memory: Count  # of the LSTM of each edge, in each direction (dnri)
+    head: Count  # hidden size of the heads that give the edge types
+    decoder: Literal["messages", "recurrent"]  # without memory, for small systems; or with a gated memory per agent
+    decoder_hidden: Count
+    edge_types: Annotated[int, Field(ge=1)]
+    first_type_is_none: bool  # no message flows along an edge of the first type
+    batch_norm: bool  # in the encoder
+    temperature: Positive  # of the Gumbel-softmax relaxation
+    variance: Positive  # of the Gaussian likelihood, squared scaled units
+    kl_weight: NonNegative  # of the divergence of the posterior from the prior
+    none_prior: Annotated[float, Field(gt=0, lt=1)]  # nri: prior probability of the first type; the others share the rest
+
+
+class CloningSpec(Frozen):
+    """How bc, nri and dnri learn from the expert's trajectories."""
+
+    learning_rate: Positive
+    learning_rate_final: Share  # the last epoch's rate as a fraction of the first's
+    input_noise: NonNegative  # std of the Gaussian noise on the states that are read in training, scaled units
 
 
 class CurriculumSpec(Frozen):
-    """How often generation is put back on the expert's track while training (section 3.3)."""
+    """How often generation is put back on the expert's track while training (section 3.3). E is training.epochs."""
 
-    name: Literal["none", "trajectory-forcing"]
-    beta: Fraction  # in fractions of all epochs: f(e) = 1.5 ** (-e / (beta * epochs))
+    name: Literal["none", "trajectory-forcing", "teacher-forcing", "scheduled-sampling"]
+    beta: Fraction  # trajectory forcing: f(e) = 1.5 ** (-e / (beta * E))
+    rate: Fraction  # teacher forcing: the probability of an intervention at each step; 1 always, 0 never
+    decay: Literal["linear", "exponential", "inverse-sigmoid"]  # scheduled sampling (Bengio et al. 2015)
+    half_life: Share  # scheduled sampling: the fraction of E after which the probability is 1/2
+    steepness: Annotated[float, Field(gt=1, allow_inf_nan=False)]  # scheduled sampling: k of the inverse sigmoid
 
 
 class TrainingSpec(Frozen):
     """Budget and batches."""
 
     epochs: Count
-    updates: Count  # SAC steps in each epoch
+    updates: Count  # gradient steps in each epoch (SAC steps in the adversarial methods)
     batch: Count  # trajectories in a batch
-    time_steps: (
-        Count  # random time steps of each trajectory that an update uses (only the encoder needs whole sequences)
-    )
-    rollouts: Count  # trajectories generated in each epoch
-    replay: Count  # generated trajectories kept
-    decay_start: (
-        Fraction  # fraction of the epochs after which the learning rates fall, geometrically, to their final values
-    )
-    policy_average: Annotated[
-        float, Field(ge=0, lt=1)
-    ]  # decay of the averaged actor that is evaluated; 0 evaluates the actor itself
+    # fraction of the epochs after which the learning rates fall, geometrically, to their final values
+    decay_start: Fraction
     gradient_clip: Positive
 
 
@@ -149,18 +200,35 @@ class EvaluationSpec(Frozen):
 
 
 class RunSpec(Frozen):
-    """Everything that defines a run but its seed."""
+    """Everything that defines a run but its seed. A section that the method does not use is null (see SECTIONS)."""
 
-    method: Literal["ssail"]
+    method: Method
     environment: Literal["yjunction"]
     profile: str
     data: DataSpec
-    model: ModelSpec
-    adversarial: AdversarialSpec
-    sac: SacSpec
-    curriculum: CurriculumSpec
-    training: TrainingSpec
+    model: ModelSpec | None
+    adversarial: AdversarialSpec | None
+    self_supervision: SelfSupervisionSpec | None
+    wasserstein: WassersteinSpec | None
+    sac: SacSpec | None
+    variational: VariationalSpec | None
+    cloning: CloningSpec | None
+    curriculum: CurriculumSpec | None
+    training: TrainingSpec | None
     evaluation: EvaluationSpec
+
+    @model_validator(mode="after")
+    def _has_its_sections(self) -> Self:
+        for name in OPTIONAL_SECTIONS:
+            used, given = name in SECTIONS[self.method], getattr(self, name) is not None
+            if used != given:
+                raise ValueError(f"method {self.method} {'needs' if used else 'has no'} section {name}")
+        return self
+
+    @property
+    def epochs(self) -> int:
+        """Training epochs; 0 for a reference that needs no training."""
+        return self.training.epochs if self.training else 0
 
     def as_json(self) -> str:
         """Canonical JSON: sorted keys, no spaces; equal specs give equal text."""
@@ -174,3 +242,6 @@ class RunSpec(Frozen):
     def from_mapping(cls, values: dict[str, Any]) -> Self:
         """Validate plain nested values. Raises pydantic.ValidationError, for ssmail.experiments to explain."""
         return cls.model_validate(values)
+
+
+OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for sections in SECTIONS.values() for name in sections))
