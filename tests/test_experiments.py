@@ -1,7 +1,9 @@
 """experiments.yaml -> specs: the order of the layers, and one sentence for everything a user can get wrong."""
 
 import contextlib
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -9,7 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssmail.errors import InputError
-from ssmail.experiments import ENVIRONMENT_VARIABLE, build_spec, figure_requirements, load_experiments
+from ssmail.experiments import (
+    ENVIRONMENT_VARIABLE,
+    FigureRequirements,
+    ablation,
+    ablation_specs,
+    build_spec,
+    figure_requirements,
+    leaves,
+    load_experiments,
+)
 from ssmail.spec import RunSpec
 
 SHIPPED = load_experiments()
@@ -27,7 +38,7 @@ def complaint(*overrides: str) -> str:
 
 def write(path: Path, **changes: object) -> Path:
     """The shipped file with some sections replaced."""
-    sections = ("defaults", "environments", "methods", "profiles", "figures")
+    sections = ("defaults", "environments", "methods", "profiles", "ablations", "figures")
     content = {name: getattr(SHIPPED, name) for name in sections} | changes
     path.write_text(yaml.safe_dump({name: value for name, value in content.items() if value is not None}))
     return path
@@ -35,25 +46,25 @@ def write(path: Path, **changes: object) -> Path:
 
 def test_each_layer_wins_over_the_ones_before_it(tmp_path: Path) -> None:
     layers: dict[str, dict[str, object]] = {
-        "environments": {"yjunction": {"sac": {"gamma": 0.1, "polyak": 0.1, "graph_entropy": 0.1, "mixed_share": 0.1}}},
-        "methods": {"ssail": {"sac": {"polyak": 0.2, "graph_entropy": 0.2, "mixed_share": 0.2}}},
-        "profiles": {"quick": {"sac": {"graph_entropy": 0.3, "mixed_share": 0.3}}},
+        "environments": {"yjunction": {"sac": dict.fromkeys(("gamma", "polyak", "graph_entropy", "temperature"), 0.1)}},
+        "methods": {"ssail": {"sac": {"polyak": 0.2, "graph_entropy": 0.2, "temperature": 0.2}}},
+        "profiles": {"quick": {"sac": {"graph_entropy": 0.3, "temperature": 0.3}}},
     }
     file = write(tmp_path / "e.yaml", **layers)
-    spec = build_spec("ssail", "yjunction", "quick", ["sac.mixed_share=0.4"], file)
-    assert (spec.sac.gamma, spec.sac.polyak, spec.sac.graph_entropy, spec.sac.mixed_share) == (0.1, 0.2, 0.3, 0.4)
+    spec = build_spec("ssail", "yjunction", "quick", ["sac.temperature=0.4"], file)
+    assert (spec.sac.gamma, spec.sac.polyak, spec.sac.graph_entropy, spec.sac.temperature) == (0.1, 0.2, 0.3, 0.4)
     defaults = SHIPPED.defaults["sac"]
-    assert spec.sac.temperature == defaults["temperature"]  # an untouched neighbour keeps its default
+    assert spec.sac.target_entropy == defaults["target_entropy"]  # an untouched neighbour keeps its default
 
 
 def test_a_profile_may_speak_to_one_method_or_environment_after_its_own_keys(tmp_path: Path) -> None:
     profile = {
-        "sac": {"gamma": 0.1, "polyak": 0.1, "mixed_share": 0.1},
-        "environments": {"yjunction": {"sac": {"polyak": 0.2, "mixed_share": 0.2}}},
-        "methods": {"ssail": {"sac": {"mixed_share": 0.3}}},
+        "sac": {"gamma": 0.1, "polyak": 0.1, "temperature": 0.1},
+        "environments": {"yjunction": {"sac": {"polyak": 0.2, "temperature": 0.2}}},
+        "methods": {"ssail": {"sac": {"temperature": 0.3}}},
     }
     spec = build_spec("ssail", "yjunction", "quick", (), write(tmp_path / "e.yaml", profiles={"quick": profile}))
-    assert (spec.sac.gamma, spec.sac.polyak, spec.sac.mixed_share) == (0.1, 0.2, 0.3)
+    assert (spec.sac.gamma, spec.sac.polyak, spec.sac.temperature) == (0.1, 0.2, 0.3)
 
 
 def test_the_last_override_wins_and_neighbours_survive() -> None:
@@ -85,7 +96,11 @@ def test_a_whole_number_is_a_float_and_gives_the_same_spec() -> None:
         ("sca.gama=0.9", "unknown key 'sca.gama' in --set; did you mean sac.gamma?"),
         ("adversarial.gamma=0.9", "unknown key 'adversarial.gamma' in --set; did you mean sac.gamma?"),
         ("sac.gamma.x=1", "unknown key 'sac.gamma.x' in --set; did you mean sac.gamma?"),
-        ("curriculum.zzz=1", "unknown key 'curriculum.zzz' in --set; choose from curriculum.name, curriculum.beta."),
+        (
+            "curriculum.zzz=1",
+            "unknown key 'curriculum.zzz' in --set; choose from curriculum.name, "
+            "curriculum.beta, curriculum.rate, curriculum.decay, curriculum.half_life, curriculum.steepness.",
+        ),
         ("sac.gamma=abc", "sac.gamma = abc in --set should be a number."),
         ("sac.gamma='0.9'", "sac.gamma = '0.9' in --set should be a number."),
         ("training.epochs=1.5", "training.epochs = 1.5 in --set should be a whole number."),
@@ -93,9 +108,13 @@ def test_a_whole_number_is_a_float_and_gives_the_same_spec() -> None:
         ("sac.automatic_temperature=1", "sac.automatic_temperature = 1 in --set should be true or false."),
         ("data.path=3", "data.path = 3 in --set should be text."),
         ("curriculum.beta=-0.1", "curriculum.beta = -0.1 in --set should be greater than or equal to 0."),
-        ("curriculum.name=forcing", "curriculum.name = forcing in --set should be 'none' or 'trajectory-forcing'."),
+        (
+            "curriculum.name=forcing",
+            "curriculum.name = forcing in --set should be 'none', 'trajectory-forcing', 'teacher-forcing' or "
+            "'scheduled-sampling'.",
+        ),
         ("sac.temperature=.inf", "sac.temperature = .inf in --set should be a finite number."),
-        ("adversarial.alpha_low=3", "adversarial: alpha_low 3 is above alpha_high 1; swap them."),
+        ("self_supervision.alpha_low=3", "self_supervision: alpha_low 3 is above alpha_high 1; swap them."),
         ("sac=3", "sac = 3 in --set is a section, not a value; set one of its keys such as sac.gamma."),
         ("method=gail", "'method' in --set cannot be set there; give it with --method."),
         ("environment=x", "'environment' in --set cannot be set there; give it with --env."),
@@ -182,8 +201,110 @@ def test_the_environment_variable_replaces_the_shipped_file(tmp_path: Path, monk
     assert load_experiments(SHIPPED.path).path == SHIPPED.path  # an explicit file wins
 
 
+def test_an_ablation_varies_one_key_alone() -> None:
+    beta = ablation("beta")
+    specs = ablation_specs("beta", "quick")
+    assert list(specs) == list(beta.values)
+    assert (beta.method, beta.environment, beta.key) == ("ssail", "yjunction", "curriculum.beta")
+    flat = {value: dict(leaves(json.loads(spec.as_json()))) for value, spec in specs.items()}
+    assert {value: spec.pop("curriculum.beta") for value, spec in flat.items()} == {value: value for value in flat}
+    assert len({json.dumps(spec) for spec in flat.values()}) == 1
+
+
+def test_the_values_of_an_ablation_may_be_given_and_count_once() -> None:
+    assert list(ablation_specs("beta", "smoke", [0.5, 0, 0.0, 5e-1, 1])) == [0.5, 0.0, 1.0]
+    assert all(isinstance(value, float) for value in ablation_specs("beta", "smoke", [0, 1]))
+
+
+def test_two_ablations_share_the_spec_that_both_hold() -> None:
+    curriculum, beta = (ablation_specs(name, "quick") for name in ("curriculum", "beta"))
+    assert curriculum["trajectory-forcing"].hash() == beta[0.15].hash()
+    assert curriculum["teacher-forcing"].hash() not in {spec.hash() for spec in beta.values()}
+
+
+def test_the_layers_of_an_ablation(tmp_path: Path) -> None:
+    entry = {**SHIPPED.ablations["beta"], "settings": {"sac": dict.fromkeys(("gamma", "polyak", "temperature"), 0.2)}}
+    profile = {
+        "sac": dict.fromkeys(("gamma", "polyak", "temperature", "graph_entropy"), 0.1),
+        "ablations": {"beta": {"sac": {"polyak": 0.3, "temperature": 0.3}}},
+    }
+    file = write(tmp_path / "e.yaml", ablations={"beta": entry}, profiles={"quick": profile}, figures={})
+    spec = ablation_specs("beta", "quick", [0.25], ["sac.temperature=0.4"], file)[0.25]
+    assert (spec.sac.graph_entropy, spec.sac.gamma, spec.sac.polyak, spec.sac.temperature) == (0.1, 0.2, 0.3, 0.4)
+    assert build_spec("ssail", "yjunction", "quick", file=file).sac.gamma == 0.1  # alone, it knows of no ablation
+
+
+@pytest.mark.parametrize("profile", SHIPPED.profiles)
+def test_an_ablation_costs_no_more_than_its_profile(profile: str) -> None:
+    epochs = build_spec("ssail", "yjunction", profile).epochs
+    assert all(spec.epochs <= epochs for name in SHIPPED.ablations for spec in ablation_specs(name, profile).values())
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "overrides", "sentence"),
+    [
+        ("bta", None, [], "unknown ablation 'bta'; did you mean beta?"),
+        ("beta", [0.1, 2], [], "curriculum.beta = 2 in --values should be less than or equal to 1."),
+        ("beta", ["a"], [], "curriculum.beta = a in --values should be a number."),
+        ("beta", None, ["sac.gama=1"], "unknown key 'sac.gama' in --set; did you mean sac.gamma?"),
+        (
+            "beta",
+            None,
+            ["curriculum={beta: 0.1}"],
+            "curriculum.beta is what the ablation beta varies; give its values with --values, not --set.",
+        ),
+    ],
+)
+def test_a_bad_ablation_is_one_sentence(name: str, values: Any, overrides: list[str], sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        ablation_specs(name, "smoke", values, overrides)
+    assert str(caught.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"values": []}, "ablations.beta of e.yaml needs values (a list); add it."),
+        ({"key": None}, "ablations.beta of e.yaml needs key (text); add it."),
+        ({"kye": "x"}, "unknown key 'kye' in ablations.beta of e.yaml; did you mean key?"),
+        ({"key": "curriculum.bta"}, "unknown key 'curriculum.bta' in ablations.beta of e.yaml; "),
+        ({"values": [3]}, "curriculum.beta = 3 in ablations.beta of e.yaml should be less than or equal to 1."),
+        ({"method": "bc"}, "method bc has no section 'curriculum' to set in ablations.beta of e.yaml; it belongs to "),
+        ({"method": "ssial"}, "unknown method 'ssial'; did you mean ssail?"),
+        ({"settings": {"sac": {"gama": 1}}}, "unknown key 'sac.gama' in ablations.beta.settings of e.yaml; did you "),
+    ],
+)
+def test_a_wrong_ablation_in_the_file_is_one_sentence(tmp_path: Path, change: dict[str, Any], sentence: str) -> None:
+    file = write(tmp_path / "e.yaml", ablations={"beta": {**SHIPPED.ablations["beta"], **change}}, figures={})
+    with pytest.raises(InputError) as caught:
+        ablation_specs("beta", "paper", file=file)
+    assert str(caught.value).startswith(sentence)
+
+
+def test_a_profile_that_speaks_to_an_unknown_ablation(tmp_path: Path) -> None:
+    profiles = {"quick": {"ablations": {"bta": {}}}}
+    with pytest.raises(InputError, match=r"unknown ablation in profiles\.quick of e\.yaml 'bta'; did you mean beta\?"):
+        build_spec("ssail", "yjunction", "quick", (), write(tmp_path / "e.yaml", profiles=profiles))
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ({"methods": ["ssail"]}, "figures.fig6 of e.yaml needs an environment, and either methods or an ablation"),
+        ({"environment": "yjunction"}, "figures.fig6 of e.yaml needs an environment, and either methods or an "),
+        ({"environment": "yjunction", "ablation": "bta"}, "unknown ablation 'bta'; did you mean beta?"),
+        ({"environment": "mocap", "ablation": "beta"}, "figures.fig6 of e.yaml draws mocap, but its ablation is of "),
+    ],
+)
+def test_a_wrong_figure_in_the_file_is_one_sentence(tmp_path: Path, entry: dict[str, Any], sentence: str) -> None:
+    file = write(tmp_path / "e.yaml", figures={"fig6": entry})
+    with pytest.raises(InputError) as caught:
+        figure_requirements("fig6", file)
+    assert str(caught.value).startswith(sentence)
+
+
 def test_a_figure_names_its_runs() -> None:
-    assert figure_requirements("fig5").environment == "yjunction"
-    assert "ssail" in figure_requirements("fig5").methods
+    assert figure_requirements("fig4") == FigureRequirements("yjunction", ("ssail", "gail", "wail"))
+    assert figure_requirements("fig6") == FigureRequirements("yjunction", ("ssail",), "beta")
     with pytest.raises(InputError, match=r"unknown figure 'figg5'; did you mean fig5\?"):
         figure_requirements("figg5")

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from ssmail.experiments import build_spec, figure_requirements, load_experiments
+from ssmail.experiments import ablation_specs, build_spec, figure_requirements, load_experiments
 from ssmail.spec import ENVIRONMENTS, METHODS, RunSpec
 
 EXPERIMENTS = load_experiments()
@@ -30,10 +30,19 @@ def test_the_file_names_every_method_and_environment() -> None:
 
 @pytest.mark.parametrize("figure", EXPERIMENTS.figures)
 def test_every_figure_names_runs_that_can_be_trained(figure: str) -> None:
-    environment, methods = figure_requirements(figure)
+    environment, methods, ablation = figure_requirements(figure)
     assert methods
     for method in methods:
         assert build_spec(method, environment, "quick").environment == environment
+    assert ablation is None or ablation in EXPERIMENTS.ablations
+
+
+@pytest.mark.parametrize("profile", EXPERIMENTS.profiles)
+@pytest.mark.parametrize("name", EXPERIMENTS.ablations)
+def test_every_value_of_every_ablation_builds_a_spec(name: str, profile: str) -> None:
+    specs = ablation_specs(name, profile)
+    assert list(specs) == EXPERIMENTS.ablations[name]["values"]
+    assert len({spec.hash() for spec in specs.values()}) == len(specs)
 
 
 def test_the_profiles_grow() -> None:

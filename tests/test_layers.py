@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    ("errors", "spec"),
+    ("errors", "spec", "spec_keys", "strict_yaml"),
     ("experiments",),
     ("data", "envs"),
     ("models",),

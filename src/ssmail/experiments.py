@@ -1,30 +1,25 @@
 """experiments.yaml -> run specs: defaults <- environments.ENV <- methods.METHOD <- profiles.PROFILE <- overrides.
 
 A profile may itself hold `environments: {ENV: {...}}` and `methods: {METHOD: {...}}`, which apply after its own keys.
+The specs of an ablation have its `settings`, and then the profile's `ablations: {NAME: {...}}`, before the overrides.
 """
 
-import difflib
 import os
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
+from ssmail import strict_yaml
 from ssmail.errors import InputError
 from ssmail.spec import OPTIONAL_SECTIONS, SECTIONS, RunSpec
+from ssmail.spec_keys import check_keys, check_section, nearest, sentence
 
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
 _FILE_NAME = "experiments.yaml"
-_ARGUMENTS = (
-    "method",
-    "environment",
-    "profile",
-)  # spec fields that come from build_spec's arguments, never from a mapping
-
 Mappings = Mapping[str, Mapping[str, Any]]
 
 
@@ -37,14 +32,26 @@ class Experiments:
     environments: Mappings
     methods: Mappings
     profiles: Mappings
+    ablations: Mappings
     figures: Mappings
 
 
+class Ablation(NamedTuple):
+    """One method trained for several values of one key of its spec."""
+
+    name: str
+    method: str
+    environment: str
+    key: str  # dotted, as curriculum.beta
+    values: tuple[Any, ...]
+
+
 class FigureRequirements(NamedTuple):
-    """The runs that a figure draws."""
+    """The runs that a figure draws: those of the methods, or (ablation not None) those of the ablation's values."""
 
     environment: str
     methods: tuple[str, ...]
+    ablation: str | None = None
 
 
 class _Layer(NamedTuple):
@@ -70,32 +77,58 @@ def build_spec(
     """
     experiments = load_experiments(file)
     layers = _file_layers(experiments, method, environment, profile)
-    layers += [_Layer(source, _parse_override(text)) for text in overrides]
-    merged: dict[str, Any] = {}
-    origins: dict[str, str] = {}
-    for layer in layers:
-        given = dict(leaves(layer.values))
-        _check_keys(given, layer.source)
-        origins.update(dict.fromkeys(given, layer.source))
-        merged = _merge(merged, layer.values)
-    for text in overrides:
-        _check_section(text.partition(".")[0].strip(), method, source)
-    merged |= {name: None for name in OPTIONAL_SECTIONS if name not in SECTIONS[method]}
-    try:
-        return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
-    except ValidationError as error:
-        raise InputError(_sentence(error, origins, experiments.path)) from None
+    return _assemble(experiments, [*layers, *_override_layers(overrides, method, source)], method, environment, profile)
+
+
+def ablation(name: str, file: Path | None = None) -> Ablation:
+    """The ablation `name` ("beta") of experiments.yaml. Raises InputError for an unknown or incomplete one."""
+    return _ablation(load_experiments(file), name)
+
+
+def ablation_specs(
+    name: str,
+    profile: str,
+    values: Sequence[Any] | None = None,
+    overrides: Sequence[str] = (),
+    file: Path | None = None,
+) -> dict[Any, RunSpec]:
+    """The spec for each of `values` (else the ablation's own), by the value as the spec holds it, each value once.
+
+    Layers: those of build_spec's method, environment and profile, the ablation's settings, the profile's settings for
+    it, the overrides, the value. Raises InputError as build_spec does (a wrong value is "in --values" or in the file),
+    and for an override of the ablated key.
+    """
+    return _ablation_specs(load_experiments(file), name, profile, values, overrides)
+
+
+def ablation_hashes(name: str, file: Path | None = None) -> list[str]:
+    """The hashes of the ablation's specs in every profile."""
+    experiments = load_experiments(file)
+    found = (_ablation_specs(experiments, name, profile, None, ()) for profile in experiments.profiles)
+    return [spec.hash() for specs in found for spec in specs.values()]
 
 
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
-    """The environment and methods whose runs figure `name` ("fig4") draws. Raises InputError for an unknown figure."""
+    """The runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
     experiments = load_experiments(file)
     entry = _named(experiments.figures, "figure", name)
-    try:
-        environment, methods = entry["environment"], entry["methods"]
-    except KeyError as missing:
-        raise InputError(f"figures.{name} in {experiments.path} has no key {missing}; add it.") from None
-    return FigureRequirements(environment, tuple(methods))
+    source = f"figures.{name} of {experiments.path.name}"
+    if "environment" not in entry or ("methods" in entry) == ("ablation" in entry):
+        raise InputError(f"{source} needs an environment, and either methods or an ablation; correct it.")
+    if "methods" in entry:
+        return FigureRequirements(entry["environment"], tuple(entry["methods"]))
+    needed = _ablation(experiments, entry["ablation"])
+    if needed.environment != entry["environment"]:
+        raise InputError(f"{source} draws {entry['environment']}, but its ablation is of {needed.environment}.")
+    return FigureRequirements(needed.environment, (needed.method,), needed.name)
+
+
+def spec_value(spec: RunSpec, key: str) -> Any:
+    """The value of a dotted key of the spec."""
+    value: Any = spec
+    for part in key.split("."):
+        value = getattr(value, part)
+    return value
 
 
 def load_experiments(file: Path | None = None) -> Experiments:
@@ -104,13 +137,13 @@ def load_experiments(file: Path | None = None) -> Experiments:
     Raises InputError for a file that is missing, is not YAML (naming the line), or has other sections than Experiments.
     """
     path = file or _find_file()
-    content = _read_yaml(path)
+    content = strict_yaml.read(path)
     sections = [field.name for field in fields(Experiments) if field.name != "path"]
     if not isinstance(content, dict):
         raise InputError(f"{path} holds no mapping; it needs the sections {', '.join(sections)}.")
     for name in content:
         if name not in sections:
-            raise InputError(f"unknown section '{name}' in {path}; {_nearest(str(name), sections)}")
+            raise InputError(f"unknown section '{name}' in {path}; {nearest(str(name), sections)}")
     for name in sections:
         if not isinstance(content.get(name), dict):
             raise InputError(f"section '{name}' of {path} is missing or no mapping; compare with the shipped one.")
@@ -128,7 +161,7 @@ def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
 
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
     """The error for a misspelt name: one sentence with the nearest of `choices`, or all of them."""
-    return InputError(f"unknown {kind} '{name}'; {_nearest(name, choices)}")
+    return InputError(f"unknown {kind} '{name}'; {nearest(name, choices)}")
 
 
 def _find_file() -> Path:
@@ -138,6 +171,24 @@ def _find_file() -> Path:
     package = Path(__file__).parent
     packaged, checkout = package / _FILE_NAME, package.parents[1] / _FILE_NAME
     return packaged if packaged.exists() else checkout
+
+
+def _assemble(
+    experiments: Experiments, layers: Iterable[_Layer], method: str, environment: str, profile: str
+) -> RunSpec:
+    """The spec of these layers, weakest first."""
+    merged: dict[str, Any] = {}
+    origins: dict[str, str] = {}
+    for layer in layers:
+        given = dict(leaves(layer.values))
+        check_keys(given, layer.source)
+        origins.update(dict.fromkeys(given, layer.source))
+        merged = _merge(merged, layer.values)
+    merged |= {name: None for name in OPTIONAL_SECTIONS if name not in SECTIONS.get(method, ())}
+    try:
+        return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
+    except ValidationError as error:
+        raise InputError(sentence(error, origins, experiments.path)) from None
 
 
 def _file_layers(experiments: Experiments, method: str, environment: str, profile: str) -> list[_Layer]:
@@ -150,12 +201,14 @@ def _file_layers(experiments: Experiments, method: str, environment: str, profil
     for section, chosen, known in (
         ("environments", environment, experiments.environments),
         ("methods", method, experiments.methods),
+        ("ablations", None, experiments.ablations),  # here for the check of its names; see _ablation_layers
     ):
         entries = _mapping(profile_values.pop(section, None), f"profiles.{profile}.{section} of {file}")
         for name in entries:
             _named(known, f"{section.removesuffix('s')} in profiles.{profile} of {file}", name)
-        source = f"profiles.{profile}.{section}.{chosen} of {file}"
-        special.append(_Layer(source, _mapping(entries.get(chosen), source)))
+        if chosen is not None:
+            source = f"profiles.{profile}.{section}.{chosen} of {file}"
+            special.append(_Layer(source, _mapping(entries.get(chosen), source)))
     return [
         _Layer(f"defaults of {file}", experiments.defaults),
         _Layer(f"environments.{environment} of {file}", environment_values),
@@ -163,6 +216,57 @@ def _file_layers(experiments: Experiments, method: str, environment: str, profil
         _Layer(f"profiles.{profile} of {file}", profile_values),
         *special,
     ]
+
+
+def _ablation(experiments: Experiments, name: str) -> Ablation:
+    entry = _named(experiments.ablations, "ablation", name)
+    source = f"ablations.{name} of {experiments.path.name}"
+    choices = (*Ablation._fields[1:], "settings")
+    for key in entry:
+        if key not in choices:
+            raise InputError(f"unknown key '{key}' in {source}; {nearest(str(key), choices)}")
+    for key in Ablation._fields[1:]:
+        if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
+            raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
+    check_section(entry["key"].partition(".")[0], entry["method"], source)
+    return Ablation(name, entry["method"], entry["environment"], entry["key"], tuple(entry["values"]))
+
+
+def _ablation_specs(
+    experiments: Experiments, name: str, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
+) -> dict[Any, RunSpec]:
+    found = _ablation(experiments, name)
+    layers = _file_layers(experiments, found.method, found.environment, profile)
+    layers += _ablation_layers(experiments, name, profile)
+    given = _override_layers(overrides, found.method, "--set")
+    if any(found.key in dict(leaves(layer.values)) for layer in given):
+        raise InputError(f"{found.key} is what the ablation {name} varies; give its values with --values, not --set.")
+    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
+    specs: dict[Any, RunSpec] = {}
+    for value in found.values if values is None else values:
+        varied = _Layer(source, _nested(found.key, value))
+        spec = _assemble(experiments, [*layers, *given, varied], found.method, found.environment, profile)
+        specs[spec_value(spec, found.key)] = spec
+    return specs
+
+
+def _ablation_layers(experiments: Experiments, name: str, profile: str) -> list[_Layer]:
+    """What an ablation sets, and what the profile sets for it."""
+    file = experiments.path.name
+    own, special = f"ablations.{name}.settings of {file}", f"profiles.{profile}.ablations.{name} of {file}"
+    entries = _mapping(experiments.profiles[profile], f"profiles.{profile}").get("ablations") or {}
+    return [
+        _Layer(own, _mapping(experiments.ablations[name].get("settings"), own)),
+        _Layer(special, _mapping(entries.get(name), special)),
+    ]
+
+
+def _override_layers(overrides: Sequence[str], method: str, source: str) -> list[_Layer]:
+    """A layer for each override."""
+    layers = [_Layer(source, _parse_override(text)) for text in overrides]
+    for layer in layers:
+        check_section(next(iter(layer.values)), method, source)
+    return layers
 
 
 def _named(mappings: Mappings, kind: str, name: str) -> Mapping[str, Any]:
@@ -176,14 +280,8 @@ def _mapping(value: Any, source: str) -> Mapping[str, Any]:
     if value is None:
         return {}
     if not isinstance(value, Mapping):
-        raise InputError(f"{source} should be a mapping, not {_shown(value)}.")
+        raise InputError(f"{source} should be a mapping, not {strict_yaml.shown(value)}.")
     return value
-
-
-def _nearest(name: str, choices: Iterable[str]) -> str:
-    choices = list(choices)
-    near = difflib.get_close_matches(name, choices, n=1)
-    return f"did you mean {near[0]}?" if near else f"choose from {', '.join(choices)}."
 
 
 def _parse_override(text: str) -> dict[str, Any]:
@@ -193,12 +291,16 @@ def _parse_override(text: str) -> dict[str, Any]:
     if not equals or not all(key.split(".")):
         raise InputError(f"--set takes key.path=value, not '{text}'; for example --set sac.gamma=0.9.")
     try:
-        parsed = yaml.load(value, _Loader)
+        parsed = strict_yaml.parse(value)
     except yaml.YAMLError:
         raise InputError(f"the value of --set {text} is not valid YAML; put quotes around text.") from None
-    for part in reversed(key.split(".")):
-        parsed = {part: parsed}
-    return dict(parsed)
+    return _nested(key, parsed)
+
+
+def _nested(key: str, value: Any) -> dict[str, Any]:
+    """("a.b", 0.5) -> {"a": {"b": 0.5}}."""
+    first, _, rest = key.partition(".")
+    return {first: _nested(rest, value) if rest else value}
 
 
 def _merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]:
@@ -207,111 +309,3 @@ def _merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]
         both = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
         merged[key] = _merge(merged[key], value) if both else value
     return merged
-
-
-def _spec_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, bool]]:
-    """(dotted key, whether it is a section) of every field of a spec."""
-    for name, field in model.model_fields.items():
-        section = _section(field.annotation)
-        yield f"{prefix}{name}", section is not None
-        if section:
-            yield from _spec_keys(section, f"{prefix}{name}.")
-
-
-def _check_keys(given: Mapping[str, Any], source: str) -> None:
-    known = {key: section for key, section in _spec_keys(RunSpec) if key not in _ARGUMENTS}
-    for key, value in given.items():
-        if key in _ARGUMENTS:
-            raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
-        if key not in known:
-            raise InputError(f"unknown key '{key}' in {source}; {_nearest_key(key, known)}")
-        if known[key] and not isinstance(value, Mapping):
-            first = next(other for other in known if other.startswith(f"{key}."))
-            raise InputError(
-                f"{key} = {_shown(value)} in {source} is a section, not a value; set one of its keys such as {first}."
-            )
-
-
-def _check_section(section: str, method: str, source: str) -> None:
-    """Raise InputError for a value in a section that the method does not have."""
-    if section in OPTIONAL_SECTIONS and section not in SECTIONS[method]:
-        users = ", ".join(name for name, sections in SECTIONS.items() if section in sections)
-        raise InputError(f"method {method} has no section '{section}' to set in {source}; it belongs to {users}.")
-
-
-def _section(annotation: Any) -> type[BaseModel] | None:
-    """The model of a section, `Section` or `Section | None`; None for a plain value."""
-    for kind in get_args(annotation) or (annotation,):
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            return kind
-    return None
-
-
-def _nearest_key(key: str, known: Mapping[str, bool]) -> str:
-    """The nearest key of the section; else one with the same last part; else the nearest of all; else the choices."""
-    values = [name for name, section in known.items() if not section]
-    section, _, last = key.rpartition(".")
-    siblings = {name.rpartition(".")[2]: name for name in known if name.rpartition(".")[0] == section}
-    near = [siblings[name] for name in difflib.get_close_matches(last, siblings, n=1)]
-    near = near or [name for name in values if name.rpartition(".")[2] == last]
-    near = near or ([] if siblings else difflib.get_close_matches(key, values, n=1))
-    if near:
-        return f"did you mean {near[0]}?"
-    choices = siblings.values() or [name for name in known if "." not in name]
-    return f"choose from {', '.join(choices)}."
-
-
-def _shown(value: Any) -> str:
-    """A value as YAML writes it on one line."""
-    return str(yaml.safe_dump(value, default_flow_style=True, width=10**6)).removesuffix("\n").removesuffix("\n...")
-
-
-def _sentence(error: ValidationError, origins: Mapping[str, str], path: Path) -> str:
-    """The first of a validation's complaints: the key, where it was given, what was given, what is expected."""
-    first = error.errors(include_url=False)[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "missing":
-        return f"{path} gives no value for {key}; add it under defaults."
-    if first["type"] == "value_error":
-        return f"{key}: {first['msg'].removeprefix('Value error, ')}."
-    expected = re.sub(r"^Input should be (a valid )?", "", first["msg"])
-    source = f" in {origins[key]}" if key in origins else ""
-    return f"{key} = {_shown(first['input'])}{source} should be {_article(expected)}."
-
-
-def _article(expected: str) -> str:
-    kinds = {"integer": "a whole number", "number": "a number", "boolean": "true or false", "string": "text"}
-    return kinds.get(expected, expected)
-
-
-def _read_yaml(path: Path) -> Any:
-    try:
-        return yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not UTF-8 text.") from None
-    except yaml.MarkedYAMLError as error:
-        line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise InputError(f"{path}{line} is not valid YAML: {error.problem}.") from None
-    except yaml.YAMLError:
-        raise InputError(f"{path} is not valid YAML: it holds a character that is not allowed.") from None
-
-
-class _Loader(yaml.SafeLoader):
-    """Safe YAML where 1e-3 is a number (PyYAML: text) and a key given twice an error (PyYAML: the last one holds)."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if not isinstance(key, yaml.ScalarNode):
-                continue
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is given twice", key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)

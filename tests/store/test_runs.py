@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ssmail.errors import InputError, SsmailError
-from ssmail.experiments import build_spec
+from ssmail.experiments import FigureRequirements, ablation_specs, build_spec
 from ssmail.spec import RunSpec
 from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive
 
@@ -281,8 +281,17 @@ def test_unknown_and_ambiguous_ids(store: Store, spec: RunSpec) -> None:
 
 def test_a_figure_keeps_only_its_methods(store: Store, spec: RunSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     store.start_run(spec, 0, dataset_hash=None, device="cpu")
-    monkeypatch.setattr("ssmail.experiments.figure_requirements", lambda name: ("yjunction", ("gail",)))
+    required = FigureRequirements("yjunction", ("gail",))
+    monkeypatch.setattr("ssmail.experiments.figure_requirements", lambda name: required)
     assert store.runs(figure="fig4") == []
+
+
+def test_a_figure_of_an_ablation_keeps_only_its_specs(store: Store) -> None:
+    inside = ablation_specs("beta", "smoke", [0.5])[0.5]
+    for one in (inside, *ablation_specs("beta", "smoke", [0.123]).values()):
+        store.start_run(one, 0, dataset_hash=None, device="cpu")
+    assert [row.spec_hash for row in store.runs(figure="fig6")] == [inside.hash()]
+    assert len(store.runs(figure="fig4")) == 2
 
 
 def test_artifacts(store: Store, writer: RunWriter, tmp_path: Path) -> None:

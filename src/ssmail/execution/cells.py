@@ -133,7 +133,7 @@ def plan_cell(store: Store, cell: Cell, settings: Settings) -> Plan:
         return Plan()
     if row is not None and row.state in (RunState.FINISHED, RunState.DIVERGED):
         _check_data(cell, row)
-        epochs = cell.spec.training.epochs
+        epochs = cell.spec.epochs
         epoch = epochs if row.state is RunState.FINISHED else 0
         message = f"{row.state} already, as run {row.name}"
         return Plan(skipped=Event("skipped", cell, row.id, epoch, epochs, message=message))

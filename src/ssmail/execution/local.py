@@ -63,7 +63,7 @@ class _Child:
 
     def __init__(self, index: int, job: Job) -> None:
         self.index, self.cell = index, job.cell
-        self.last = Event("started", job.cell, None, 0, job.cell.spec.training.epochs)
+        self.last = Event("started", job.cell, None, 0, job.cell.spec.epochs)
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `wait`)
         self._buffer = b""
         self.process = subprocess.Popen(
@@ -170,7 +170,7 @@ class _Pool:
         if not self.stop_signals:
             return
         for index, cell in self.waiting:
-            epochs = cell.spec.training.epochs
+            epochs = cell.spec.epochs
             self.tell(index, Event("interrupted", cell, None, 0, epochs, message="stopped before it began"))
         self.waiting.clear()
         for child in self._children:

@@ -25,7 +25,7 @@ def run_cell(
     `should_stop` is asked between epochs; once true, the run is marked interrupted and can be resumed to the same
     numbers. No exception leaves this function: a failure is an event, and the run's `error` holds the traceback.
     """
-    epochs = cell.spec.training.epochs
+    epochs = cell.spec.epochs
     if should_stop():
         return Event("interrupted", cell, None, 0, epochs, message="stopped before it began")
     try:
@@ -84,7 +84,7 @@ def _train(
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Event:
-    epochs = cell.spec.training.epochs
+    epochs = cell.spec.epochs
     while loop.epoch < epochs:
         if should_stop():
             writer.finish(RunState.INTERRUPTED, f"stopped after epoch {loop.epoch}")
