@@ -5,7 +5,7 @@ No field has a default here: each default is written once, in experiments.yaml (
 
 import hashlib
 import json
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -41,6 +41,15 @@ class Frozen(BaseModel):
     """Immutable, and an unknown key or a value of the wrong type is an error (3 is a float, "3" and True are not)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+Section = TypeVar("Section", bound=Frozen)
+
+
+def used(section: Section | None) -> Section:
+    """A section that the method has by SECTIONS, for those who know that it does."""
+    assert section is not None
+    return section
 
 
 class YJunctionSpec(Frozen):
@@ -157,7 +166,8 @@ class VariationalSpec(Frozen):
     temperature: Positive  # of the Gumbel-softmax relaxation
     variance: Positive  # of the Gaussian likelihood, squared scaled units
     kl_weight: NonNegative  # of the divergence of the posterior from the prior
-    none_prior: Annotated[float, Field(gt=0, lt=1)]  # nri: prior probability of the first type; the others share the rest
+    # nri: prior probability of the first type; the others share the rest
+    none_prior: Annotated[float, Field(gt=0, lt=1)]
 
 
 class CloningSpec(Frozen):

@@ -2,24 +2,33 @@ import pytest
 import torch
 
 from ssmail.experiments import build_spec
+from ssmail.spec import used
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.loop import TrainingLoop
 
 
-def learner(*overrides: str) -> tuple[AdversarialLearner, TrainingLoop]:
-    loop = TrainingLoop(build_spec("ssail", "yjunction", "smoke", overrides), 0)
+def learner(*overrides: str, method: str = "ssail") -> tuple[AdversarialLearner, TrainingLoop]:
+    loop = TrainingLoop(build_spec(method, "yjunction", "smoke", overrides), 0)
+    assert isinstance(loop.learner, AdversarialLearner)
     return loop.learner, loop
 
 
 def test_learning_rates_go_geometrically_from_first_to_final() -> None:
-    made, _ = learner("sac.actor_learning_rate_final=0.01", "adversarial.learning_rate_final=0.25")
+    made, _ = learner(
+        "sac.actor_learning_rate_final=0.01",
+        "adversarial.learning_rate_final=0.25",
+        "training.decay_start=0.0",
+        "training.epochs=5",
+    )
 
-    def rates(decayed: float) -> dict[str, float]:
-        made.set_learning_rates(decayed)
-        return {name: o.param_groups[0]["lr"] for name, o in made.optimizers.items()}
+    last_epoch = made.training.epochs - 1
 
-    first, middle, last = rates(0), rates(0.5), rates(1)
-    assert first["actor"] == made.spec.sac.actor_learning_rate
+    def rates(epoch: int) -> dict[str, float]:
+        made.rates.set(epoch)
+        return {name: o.param_groups[0]["lr"] for name, o in made.rates.optimizers.items()}
+
+    first, middle, last = rates(0), rates(last_epoch // 2), rates(last_epoch)
+    assert first["actor"] == made.actor_critic.spec.actor_learning_rate
     assert middle["actor"] == pytest.approx(first["actor"] / 10)
     assert last["actor"] == pytest.approx(first["actor"] / 100)
     assert last["discriminator"] == pytest.approx(first["discriminator"] / 4)
@@ -27,7 +36,7 @@ def test_learning_rates_go_geometrically_from_first_to_final() -> None:
 
 def test_only_states_and_actions_are_blurred() -> None:
     made, loop = learner("adversarial.input_noise=0.1", "model.time_input=true")
-    x = made._inputs(loop.experts)
+    x = made.features(loop.experts.states[:, :-1], loop.experts.states[:, 0])
     blurred = made._blurred(x, features=4)
     torch.testing.assert_close(blurred[..., 4:], x[..., 4:], rtol=0, atol=0)
     assert float((blurred - x)[..., :4].std()) == pytest.approx(0.1, rel=0.05)
@@ -36,9 +45,9 @@ def test_only_states_and_actions_are_blurred() -> None:
 
 
 def test_tau_alpha_lies_between_its_pair() -> None:
-    made, loop = learner("adversarial.alpha_low=0.5", "adversarial.alpha_high=0.5")
-    generated, _ = loop._generate(0.0)
-    mixed, alpha = made._mixed(generated, "start")
+    made, loop = learner("self_supervision.alpha_low=0.5", "self_supervision.alpha_high=0.5")
+    generated, _ = made.generate(0.0)
+    mixed, alpha = made._mixed(generated, used(made.supervision), "start")
     assert alpha.tolist() == [0.5] * len(generated)
     expert = loop.experts[generated.source]
     torch.testing.assert_close(mixed.states, (generated.states + expert.states) / 2)
@@ -47,22 +56,65 @@ def test_tau_alpha_lies_between_its_pair() -> None:
 
 def test_targets_follow_and_only_the_critic_learns_from_its_loss() -> None:
     """After one update the target critic has gone `polyak` of the way, and gradients are on again everywhere."""
-    made, loop = learner("sac.polyak=0.25")
-    latest, _ = loop._generate(0.5)
-    loop.replay.add(latest)
-    before = [p.clone() for p in made.target_critic.parameters()]
-    made.update(latest, loop.replay)
-    for old, target, source in zip(before, made.target_critic.parameters(), made.critic.parameters(), strict=True):
+    made, _ = learner("sac.polyak=0.25")
+    latest, _ = made.generate(0.5)
+    made.replay.add(latest)
+    before = [p.clone() for p in made.actor_critic.target_critic.parameters()]
+    made.update(latest)
+    for old, target, source in zip(
+        before, made.actor_critic.target_critic.parameters(), made.actor_critic.critic.parameters(), strict=True
+    ):
         torch.testing.assert_close(target, old + 0.25 * (source - old))
-    assert all(p.requires_grad for p in made.critic.parameters())
-    assert not any(p.requires_grad for p in made.target_critic.parameters())
+    assert all(p.requires_grad for p in made.actor_critic.critic.parameters())
+    assert not any(p.requires_grad for p in made.actor_critic.target_critic.parameters())
 
 
 def test_the_temperature_is_fixed_or_learned() -> None:
     for automatic in (True, False):
-        made, loop = learner(f"sac.automatic_temperature={str(automatic).lower()}", "sac.temperature=0.1")
-        latest, _ = loop._generate(0.0)
-        loop.replay.add(latest)
-        made.update(latest, loop.replay)
-        moved = abs(float(made.temperature) - 0.1) > 1e-6
+        made, _ = learner(f"sac.automatic_temperature={str(automatic).lower()}", "sac.temperature=0.1")
+        latest, _ = made.generate(0.0)
+        made.replay.add(latest)
+        made.update(latest)
+        moved = abs(float(made.actor_critic.temperature) - 0.1) > 1e-6
         assert moved is automatic
+
+
+def test_methods_differ_only_in_what_the_discriminator_is_taught() -> None:
+    """Same seed: the same weights, the same first tau_G and the same temperature; then their own terms."""
+    made = {method: learner(method=method)[0] for method in ("ssail", "gail", "wail")}
+    latest = {method: one.generate(0.0)[0] for method, one in made.items()}
+    for method in ("gail", "wail"):
+        assert torch.equal(latest[method].states, latest["ssail"].states)
+        for p, q in zip(made[method].discriminator.parameters(), made["ssail"].discriminator.parameters(), strict=True):
+            assert torch.equal(p, q)
+    terms = {}
+    for method, one in made.items():
+        one.replay.add(latest[method])
+        terms[method] = {name for name in one.update(latest[method]) if name.startswith("discriminator/")}
+    both = {"discriminator/loss", "discriminator/generated", "discriminator/expert"}
+    assert terms == {
+        "ssail": both | {"discriminator/self_supervised"},
+        "gail": both,
+        "wail": both | {"discriminator/penalty"},
+    }
+
+
+def test_actor_critic_of_gail_and_wail_learns_from_generated_trajectories_only() -> None:
+    for method, mixes in (("ssail", True), ("gail", False), ("wail", False)):
+        made, _ = learner(method=method)
+        latest, _ = made.generate(0.0)
+        made.replay.add(latest)
+        batch = made._actor_batch()
+        generated = [any(torch.equal(row, kept) for kept in latest.states) for row in batch.states]
+        assert all(generated) is not mixes
+
+
+def test_clipping_bounds_the_critic_and_the_penalty_does_not() -> None:
+    for constraint, bounded in (("clipping", True), ("penalty", False)):
+        made, _ = learner(f"wasserstein.constraint={constraint}", "wasserstein.clip=0.01", method="wail")
+        latest, _ = made.generate(0.0)
+        made.replay.add(latest)
+        values = made.update(latest)
+        assert ("discriminator/penalty" in values) is not bounded
+        largest = max(float(p.detach().abs().max()) for p in made.discriminator.parameters())
+        assert (largest <= 0.01) is bounded

@@ -6,13 +6,21 @@ import pytest
 import torch
 
 from ssmail.experiments import build_spec
-from ssmail.spec import RunSpec
+from ssmail.spec import METHODS, RunSpec
+from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.loop import Divergence, TrainingLoop
+
+LEARNING = [method for method in METHODS if build_spec(method, "yjunction", "smoke").epochs]
 
 
 @pytest.fixture(scope="module")
 def spec() -> RunSpec:
-    return build_spec("ssail", "yjunction", "smoke", ["training.epochs=4", "training.policy_average=0.9"])
+    return build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
+
+
+def adversarial(loop: TrainingLoop) -> AdversarialLearner:
+    assert isinstance(loop.learner, AdversarialLearner)
+    return loop.learner
 
 
 def epochs(loop: TrainingLoop, count: int) -> list[dict[str, float]]:
@@ -32,7 +40,9 @@ def test_same_seed_same_numbers_other_seed_other_numbers(spec: RunSpec) -> None:
     assert first != other
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(spec: RunSpec, tmp_path: Path) -> None:
+@pytest.mark.parametrize("method", LEARNING)
+def test_a_resumed_run_equals_an_uninterrupted_one(method: str, tmp_path: Path) -> None:
+    spec = build_spec(method, "yjunction", "smoke", ["training.epochs=4"])
     whole = TrainingLoop(spec, 0)
     expected = epochs(whole, 4)
     expected_test, expected_arrays = whole.final_evaluation()
@@ -59,22 +69,23 @@ def test_a_resumed_run_equals_an_uninterrupted_one(spec: RunSpec, tmp_path: Path
 
 def test_the_alpha_range_leaves_weights_and_data_order_alone(spec: RunSpec) -> None:
     """Separate generators: another alpha range changes no initial weight and no generated start."""
-    other = build_spec("ssail", "yjunction", "smoke", ["adversarial.alpha_low=0.0"])
+    other = build_spec("ssail", "yjunction", "smoke", ["self_supervision.alpha_low=0.0"])
     a, b = TrainingLoop(spec, 3), TrainingLoop(other, 3)
-    for p, q in zip(a.learner.policy.parameters(), b.learner.policy.parameters(), strict=True):
-        assert torch.equal(p, q)
-    assert torch.equal(a._generate(0.5)[0].states, b._generate(0.5)[0].states)
+    for one, other_one in zip(adversarial(a).networks(), adversarial(b).networks(), strict=True):
+        for p, q in zip(one.parameters(), other_one.parameters(), strict=True):
+            assert torch.equal(p, q)
+    assert torch.equal(adversarial(a).generate(0.5)[0].states, adversarial(b).generate(0.5)[0].states)
 
 
 def test_complete_forcing_keeps_the_expert_states(spec: RunSpec) -> None:
-    loop = TrainingLoop(spec, 0)
-    batch, segment = loop._generate(1.0)
+    learner = adversarial(TrainingLoop(spec, 0))
+    experts, steps = learner.experts, learner.setting.steps
+    batch, segment = learner.generate(1.0)
     assert segment == 1
-    experts = loop.experts.states[batch.source]
-    torch.testing.assert_close(batch.states[:, : loop.steps], experts[:, : loop.steps])
-    free, segment = loop._generate(0.0)
-    assert segment == loop.steps
-    assert not torch.allclose(free.states[:, loop.steps - 1], loop.experts.states[free.source][:, loop.steps - 1])
+    torch.testing.assert_close(batch.states[:, :steps], experts.states[batch.source][:, :steps])
+    free, segment = learner.generate(0.0)
+    assert segment == steps
+    assert not torch.allclose(free.states[:, steps - 1], experts.states[free.source][:, steps - 1])
 
 
 def test_metrics_and_arrays_have_their_names_and_shapes(spec: RunSpec) -> None:
@@ -87,7 +98,7 @@ def test_metrics_and_arrays_have_their_names_and_shapes(spec: RunSpec) -> None:
         "discriminator/self_supervised",
     }
     promised |= {"critic/loss", "actor/loss", "temperature", "entropy", "seconds", "graph/entropy"}
-    promised |= {"curriculum/intervention_frequency", "curriculum/segment_length"}
+    promised |= {f"curriculum/{m}" for m in ("intervention_frequency", "segment_length", "expected_segment_length")}
     promised |= {f"{s}/{m}" for s in ("train", "validation") for m in ("mode_mse", "on_lane", "lane_balance")}
     assert promised <= record.keys()
     assert record["discriminator/loss"] == pytest.approx(
@@ -99,14 +110,14 @@ def test_metrics_and_arrays_have_their_names_and_shapes(spec: RunSpec) -> None:
     assert arrays["test/lanes"].shape == (2, test, 50, 3, 2)
     for prefix in ("test", "test_mean", "test_last", "test_constant_velocity"):
         assert {
-            f"{prefix}/{m}" for m in ("mode_mse", "on_lane", "lane_balance", "min_ade_20", "min_fde_20")
+            f"{prefix}/{m}" for m in ("mode_mse", "on_lane", "lane_balance", "min_ade_20", "min_fde_20", "one_step_mse")
         } <= values.keys()
 
 
 def test_weights_that_are_not_finite_are_a_divergence(spec: RunSpec) -> None:
     loop = TrainingLoop(spec, 0)
     with torch.no_grad():
-        next(loop.learner.critic.parameters()).fill_(torch.nan)
+        next(adversarial(loop).actor_critic.critic.parameters()).fill_(torch.nan)
     with pytest.raises(Divergence, match="epoch 1"):
         loop.run_epoch()
 
@@ -116,7 +127,7 @@ def test_a_network_reads_time_and_start_only_when_told(spec: RunSpec) -> None:
     for time in ("true", "false"):
         for start in ("true", "false"):
             made = build_spec("ssail", "yjunction", "smoke", [f"model.time_input={time}", f"model.start_input={start}"])
-            sizes[time, start] = TrainingLoop(made, 0).features.size(4)
+            sizes[time, start] = adversarial(TrainingLoop(made, 0)).features.size(4)
     assert sizes == {("true", "true"): 9, ("true", "false"): 5, ("false", "true"): 8, ("false", "false"): 4}
 
 
@@ -131,3 +142,37 @@ def test_the_best_model_uses_every_mode_if_one_does(spec: RunSpec) -> None:
     assert kept == [(True, 1), (False, 1), (True, 3), (False, 3), (True, 5), (False, 5)]
     loop._select(math.nan, 0.5)
     assert not loop.improved
+
+
+@pytest.mark.parametrize("method", LEARNING)
+def test_every_method_has_the_metrics_that_all_are_compared_by(method: str) -> None:
+    loop = TrainingLoop(build_spec(method, "yjunction", "smoke"), 0)
+    record = loop.run_epoch()
+    assert {"validation/mode_mse", "validation/lane_balance", "train/mode_mse", "seconds"} <= record.keys()
+    assert ("curriculum/segment_length" in record) is (loop.spec.curriculum is not None)
+    values, _ = loop.final_evaluation()
+    assert all(math.isfinite(value) for name, value in values.items() if not name.endswith("_ade"))
+
+
+@pytest.mark.parametrize("method", ["constant-velocity", "copy-last"])
+def test_references_need_no_training_and_know_their_answer(method: str) -> None:
+    loop = TrainingLoop(build_spec(method, "yjunction", "smoke"), 0)
+    assert loop.spec.epochs == 0
+    values, arrays = loop.final_evaluation()
+    start, steps = loop.data.test.positions[:, :1], np.arange(50)[None, :, None, None]
+    velocity = loop.data.test.velocities[:, :1] if method == "constant-velocity" else 0
+    np.testing.assert_allclose(arrays["test/rollouts"][0], start + velocity * steps, rtol=1e-4, atol=1e-4)
+    is_constant_velocity = values["test/mode_mse"] == pytest.approx(values["test_constant_velocity/mode_mse"])
+    assert is_constant_velocity is (method == "constant-velocity")
+    assert (values["test/one_step_mse"] == values["test_constant_velocity/one_step_mse"]) is is_constant_velocity
+
+
+@pytest.mark.parametrize(
+    ("name", "first", "last"), [("none", 49.0, 49.0), ("teacher-forcing", 1.0, 1.0), ("scheduled-sampling", 1.0, 49.0)]
+)
+@pytest.mark.parametrize("method", ["ssail", "dnri"])
+def test_every_generating_method_takes_every_curriculum(method: str, name: str, first: float, last: float) -> None:
+    chosen = [f"curriculum.name={name}", "curriculum.rate=1.0", "curriculum.half_life=0.2", "training.epochs=3"]
+    loop = TrainingLoop(build_spec(method, "yjunction", "smoke", chosen), 0)
+    lengths = [record["curriculum/segment_length"] for record in epochs(loop, 3)]
+    assert (lengths[0], lengths[-1]) == (first, last)

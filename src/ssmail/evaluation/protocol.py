@@ -46,7 +46,8 @@ def full_metrics(samples: Floats, truth: Trajectories, centre_lines: Floats, sca
     }
 
 
-def constant_velocity(truth: Trajectories) -> Floats:
-    """(B, T, N, P) raw positions of a group that keeps its first velocity: the reference that needs no training."""
-    steps = np.arange(truth.positions.shape[1])[None, :, None, None]
-    return truth.positions[:, :1] + truth.velocities[:, :1] * steps
+def one_step_mse(predicted: Floats, truth: Floats) -> float:
+    """Mean squared error of one-step predictions from the true past; both (B, T, N, D), scaled positions and
+    velocities.
+    """
+    return float(np.square(predicted - truth).mean())

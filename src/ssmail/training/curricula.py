@@ -9,14 +9,41 @@ from ssmail.spec import CurriculumSpec
 def intervention_frequency(spec: CurriculumSpec, epoch: int, epochs: int) -> float:
     """Probability of an intervention at each step of epoch 0 .. epochs - 1.
 
-    Trajectory Forcing: f(e) = 1.5 ** (-e / (beta * epochs));
-    beta 0 never intervenes, beta 1 always does (complete teacher forcing, section 4.5).
+    none: 0. teacher-forcing: `rate`, the same in every epoch. trajectory-forcing and scheduled-sampling: see
+    `trajectory_forcing` and `scheduled_sampling`, with x = epoch / epochs.
     """
-    if spec.name == "none" or spec.beta == 0:
+    x = epoch / epochs
+    if spec.name == "trajectory-forcing":
+        return trajectory_forcing(x, spec.beta)
+    if spec.name == "scheduled-sampling":
+        return scheduled_sampling(x, spec.decay, spec.half_life, spec.steepness)
+    return spec.rate if spec.name == "teacher-forcing" else 0.0
+
+
+def trajectory_forcing(x: float, beta: float) -> float:
+    """f = 1.5 ** (-x / beta) at the fraction x of training (section 3.3).
+
+    The edges are those of section 4.5: beta 0 never intervenes, beta 1 always does (complete teacher forcing).
+    """
+    if beta == 0:
         return 0.0
-    if spec.beta == 1:
+    if beta == 1:
         return 1.0
-    return float(1.5 ** (-epoch / (spec.beta * epochs)))
+    return float(1.5 ** (-x / beta))
+
+
+def scheduled_sampling(x: float, decay: str, half_life: float, steepness: float) -> float:
+    """The decays of Bengio et al. (2015), section 2.4, each scaled to reach 1/2 at the fraction x = `half_life` of
+    training.
+
+    linear: max(0, 1 - x / (2 h)). exponential: 2 ** (-x / h). inverse-sigmoid: k / (k + k ** (x / h)), which begins at
+    k / (k + 1).
+    """
+    if decay == "linear":
+        return max(0.0, 1 - x / (2 * half_life))
+    if decay == "exponential":
+        return float(2 ** (-x / half_life))
+    return float(1 / (1 + steepness ** (x / half_life - 1)))
 
 
 def draw_interventions(batch: int, steps: int, frequency: float, generator: torch.Generator) -> Tensor:
@@ -37,3 +64,10 @@ def mean_segment_length(interventions: Tensor) -> float:
     """
     b, t = interventions.shape
     return b * t / (b + int(interventions.sum()))
+
+
+def expected_segment_length(frequency: float, steps: int) -> float:
+    """What `mean_segment_length` tends to in large batches: T / (1 + (T - 1) f), for T steps of which all but the
+    first may be interventions.
+    """
+    return steps / (1 + (steps - 1) * frequency)

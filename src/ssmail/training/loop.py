@@ -19,14 +19,12 @@ from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.data.yjunction import generate
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
-from ssmail.evaluation.protocol import constant_velocity, full_metrics, quick_metrics
-from ssmail.models.features import Features
-from ssmail.models.policy import GraphPolicy
+from ssmail.evaluation.protocol import full_metrics, one_step_mse, quick_metrics
 from ssmail.spec import DataSpec, RunSpec
-from ssmail.training.adversarial import AdversarialLearner
-from ssmail.training.curricula import draw_interventions, intervention_frequency, mean_segment_length
-from ssmail.training.replay import Batch, Replay
-from ssmail.training.rollout import rollout
+from ssmail.training.learning import Predictor, Setting
+from ssmail.training.methods import make_learner
+from ssmail.training.references import ConstantVelocity
+from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
 
 
@@ -40,7 +38,7 @@ def expert_set(spec: DataSpec) -> ExpertSet:
 
 
 class TrainingLoop:
-    """One run. Call `run_epoch` until `epoch` reaches spec.training.epochs, then `final_evaluation`."""
+    """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`."""
 
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
         self.spec, self.device = spec, torch.device(device)
@@ -50,32 +48,22 @@ class TrainingLoop:
         self.generators = Generators(seed)
         self.experts = self._scaled(self.data.train)
         self.validation_start = self._scaled(self.data.validation).states[:, 0]
-        self.steps = self.experts.actions.shape[1]
-        self.features = Features(spec.model.time_input, spec.model.start_input, self.steps + 1)
         self.integrator = Integrator(self.scaling)
-        self.learner = AdversarialLearner(spec, self.experts, self.features, self.integrator, self.generators)
-        self.replay = Replay(spec.training.replay)
+        self.learner = make_learner(Setting(spec, self.experts, self.integrator, self.generators))
         self.epoch = 0
         self.improved = False
         self.best_neglects = True
         self.best_error = math.inf
         self.best_epoch = 0
-        self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
+        self.best_weights = deepcopy(self.learner.predictor.state_dict())
 
     def run_epoch(self) -> dict[str, float]:
-        """One epoch of Alg. 1 and its validation; returns the epoch's metrics. Raises Divergence when weights stop
+        """One epoch of training and its validation; returns the epoch's metrics. Raises Divergence when weights stop
         being finite.
         """
         began = time.perf_counter()
-        epochs = self.spec.training.epochs
-        frequency = intervention_frequency(self.spec.curriculum, self.epoch, epochs)
-        self.learner.set_learning_rates(self._decayed())
-        latest, segment = self._generate(frequency)
-        self.replay.add(latest)
-        updates = [self.learner.update(latest, self.replay) for _ in range(self.spec.training.updates)]
-        values = {name: float(np.mean([u[name] for u in updates])) for name in updates[0]}
+        values = self.learner.run_epoch(self.epoch)
         self._check_finite()
-        values |= {"curriculum/intervention_frequency": frequency, "curriculum/segment_length": segment}
         values |= self._validate()
         self.epoch += 1
         self._select(values["validation/mode_mse"], values["validation/lane_balance"])
@@ -90,25 +78,28 @@ class TrainingLoop:
         self.improved = (neglects, error) < (self.best_neglects, self.best_error)
         if self.improved:
             self.best_neglects, self.best_error, self.best_epoch = neglects, error, self.epoch
-            self.best_weights = deepcopy(self.learner.evaluated_policy().state_dict())
+            self.best_weights = deepcopy(self.learner.predictor.state_dict())
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Metrics of the best-validation model on the test split (sampled, mean), of the last model, and of constant
         velocity; and the arrays to draw.
         """
         truth, lines = self.data.test, self.data.centre_lines
-        best = deepcopy(self.learner.evaluated_policy())
+        last, reference = self.learner.predictor, ConstantVelocity(self.integrator)
+        best = deepcopy(last)
         best.load_state_dict(self.best_weights)
         sampled = self._samples(best, truth)
         candidates = {
-            "test": sampled,
-            "test_mean": self._samples(best, truth, deterministic=True),
-            "test_last": self._samples(self.learner.evaluated_policy(), truth),
-            "test_constant_velocity": constant_velocity(truth)[None],
+            "test": (best, sampled),
+            "test_mean": (best, self._samples(best, truth, deterministic=True)),
+            "test_last": (last, self._samples(last, truth)),
+            "test_constant_velocity": (reference, self._samples(reference, truth, samples=1)),
         }
         values = {"best_epoch": float(self.best_epoch)}
-        for prefix, samples in candidates.items():
-            values |= {f"{prefix}/{k}": v for k, v in full_metrics(samples, truth, lines, self.scaling).items()}
+        for prefix, (predictor, samples) in candidates.items():
+            measured = full_metrics(samples, truth, lines, self.scaling)
+            measured["one_step_mse"] = self._one_step(predictor, truth)
+            values |= {f"{prefix}/{k}": v for k, v in measured.items()}
         arrays: dict[str, np.ndarray] = {
             "test/rollouts": sampled.astype(np.float32),
             "test/expert": truth.positions.astype(np.float32),
@@ -130,7 +121,6 @@ class TrainingLoop:
                 "weights": self.best_weights,
             },
             "learner": self.learner.state_dict(),
-            "replay": self.replay.state_dict(),
             "generators": self.generators.state_dict(),
         }
 
@@ -141,7 +131,6 @@ class TrainingLoop:
         self.best_neglects, self.best_error = best["neglects"], best["error"]
         self.best_epoch, self.best_weights = best["epoch"], best["weights"]
         self.learner.load_state_dict(state["learner"])
-        self.replay.load_state_dict(state["replay"])
         self.generators.load_state_dict(state["generators"])
 
     def best_state_dict(self) -> dict[str, Any]:
@@ -158,32 +147,8 @@ class TrainingLoop:
     def _tensor(self, array: Floats) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self.device)
 
-    def _decayed(self) -> float:
-        """0 up to training.decay_start, then evenly to 1 in the last epoch."""
-        training = self.spec.training
-        progress = self.epoch / max(training.epochs - 1, 1)
-        return max(progress - training.decay_start, 0) / max(1 - training.decay_start, 1e-9)
-
-    def _generate(self, frequency: float) -> tuple[Batch, float]:
-        """tau_G from random training starts under the curriculum, and their mean segment length."""
-        count = self.spec.training.rollouts
-        source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
-        interventions = draw_interventions(count, self.steps, frequency, self.generators["curriculum"])
-        expert = self.experts.states[source]
-        made = rollout(
-            self.learner.policy,
-            self.features,
-            self.integrator,
-            expert[:, 0],
-            self.steps,
-            self.generators["policy"],
-            expert=expert,
-            interventions=interventions.to(self.device) if frequency > 0 else None,
-        )
-        return Batch(made.states, made.actions, source), mean_segment_length(interventions)
-
     def _check_finite(self) -> None:
-        for network in (self.learner.policy, self.learner.critic, self.learner.discriminator):
+        for network in self.learner.networks():
             if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
                 raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
 
@@ -193,7 +158,7 @@ class TrainingLoop:
         chosen = torch.randperm(len(self.data.train), generator=self.generators["evaluation"])[:count]
         validation, train = self.data.validation, self.data.train[chosen.numpy()]
         start = torch.cat([self.validation_start, self.experts.states[chosen.to(self.device), 0]])
-        positions = self._free_run(self.learner.evaluated_policy(), start)
+        positions = self._free_run(self.learner.predictor, start)
         values: dict[str, float] = {}
         parts = {
             "validation": (positions[: len(validation)], validation),
@@ -204,19 +169,24 @@ class TrainingLoop:
             values |= {f"{split}/{k}": v for k, v in measured.items()}
         return values
 
-    def _free_run(self, policy: GraphPolicy, start: Tensor, deterministic: bool = False) -> Floats:
+    def _free_run(self, predictor: Predictor, start: Tensor, deterministic: bool = False) -> Floats:
         """Raw positions (B, T, N, P) of one free-running rollout from each start (B, N, D), the start included."""
-        generator = self.generators["evaluation"]
-        made = rollout(
-            policy, self.features, self.integrator, start, self.steps, generator, deterministic=deterministic
-        )
-        scaled = made.states[..., : policy.action_size].double().cpu().numpy()
+        steps, generator = self.experts.actions.shape[1], self.generators["evaluation"]
+        states = predictor.free_run(start, steps, generator, deterministic=deterministic)
+        scaled = states[..., : states.shape[-1] // 2].double().cpu().numpy()
         raw: Floats = self.scaling.unscale_positions(scaled)
         return raw
 
-    def _samples(self, policy: GraphPolicy, truth: Trajectories, deterministic: bool = False) -> Floats:
-        """(S, B, T, N, P) raw positions: S rollouts of every start."""
+    def _samples(
+        self, predictor: Predictor, truth: Trajectories, deterministic: bool = False, samples: int | None = None
+    ) -> Floats:
+        """(S, B, T, N, P) raw positions: S rollouts of every start, spec.evaluation.samples by default."""
         start = self._scaled(truth).states[:, 0]
-        s = self.spec.evaluation.samples
-        positions = self._free_run(policy, start.repeat(s, 1, 1), deterministic)
+        s = samples or self.spec.evaluation.samples
+        positions = self._free_run(predictor, start.repeat(s, 1, 1), deterministic)
         return positions.reshape(s, len(truth), *positions.shape[1:])
+
+    def _one_step(self, predictor: Predictor, truth: Trajectories) -> float:
+        states = self._scaled(truth).states
+        predicted = predictor.one_step(states, self.generators["evaluation"])
+        return one_step_mse(predicted.double().cpu().numpy(), states[:, 1:].double().cpu().numpy())

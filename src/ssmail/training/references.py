@@ -1,0 +1,79 @@
+"""Predictors that need no training: what every learned one has to beat."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ssmail.envs.integrator import Integrator
+
+
+@dataclass(frozen=True)
+class ConstantVelocity:
+    """Every agent keeps the velocity of the state it is predicted from."""
+
+    integrator: Integrator
+
+    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+        """See Predictor."""
+        states = [start]
+        for _ in range(steps):
+            states.append(self._next(states[-1]))
+        return torch.stack(states, dim=1)
+
+    def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """See Predictor."""
+        return self._next(states[:, :-1])
+
+    def _next(self, state: Tensor) -> Tensor:
+        return self.integrator.step(state, state[..., state.shape[-1] // 2 :])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+
+
+@dataclass(frozen=True)
+class CopyLast:
+    """Every state, velocities included, is the one before."""
+
+    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+        """See Predictor."""
+        return start.unsqueeze(1).repeat(1, steps + 1, 1, 1)
+
+    def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """See Predictor."""
+        return states[:, :-1]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+
+
+class NothingToLearn:
+    """The learner of a reference."""
+
+    def __init__(self, predictor: ConstantVelocity | CopyLast) -> None:
+        self.predictor = predictor
+
+    def networks(self) -> list[torch.nn.Module]:
+        """None."""
+        return []
+
+    def run_epoch(self, epoch: int) -> dict[str, float]:
+        """Never called: the spec of a reference has no training epochs."""
+        raise NotImplementedError("a reference has nothing to learn")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""

@@ -1,0 +1,203 @@
+"""nri and dnri in training and in prediction: graph-conditioned motion models with a variational posterior over graphs
+(Kipf et al. 2018; Graber and Schwing 2020).
+"""
+
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.envs.integrator import Integrator
+from ssmail.losses.likelihood import fixed_prior, variational_loss
+from ssmail.models.decoders import make_decoder
+from ssmail.models.graph_encoder import GraphNoise, sample_graph
+from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from ssmail.spec import VariationalSpec, used
+from ssmail.training.actor_critic import clipped_step
+from ssmail.training.curricula import (
+    draw_interventions,
+    expected_segment_length,
+    intervention_frequency,
+    mean_segment_length,
+)
+from ssmail.training.learning import Setting, mean_of
+from ssmail.training.learning_rates import DecayingRates
+
+
+class VariationalModel(nn.Module):
+    """Encoder and decoder. dnri (`dynamic`) has a graph at each step and a learned prior; nri has one graph."""
+
+    fixed_prior: Tensor
+
+    def __init__(self, inputs: int, action_size: int, spec: VariationalSpec, dynamic: bool) -> None:
+        super().__init__()
+        self.spec, self.dynamic = spec, dynamic
+        self.encoder = DynamicEncoder(inputs, spec) if dynamic else StaticEncoder(inputs, spec)
+        self.decoder = make_decoder(inputs, action_size, spec)
+        self.register_buffer("fixed_prior", fixed_prior(spec.edge_types, spec.none_prior), persistent=False)
+        self.graph_noise = GraphNoise("edge", "step" if dynamic else "trajectory")
+
+    def posterior(self, states: Tensor) -> tuple[Tensor, Tensor]:
+        """states (B, T, N, D) -> logits of the posterior, (B, T or 1, N, N, K), and of the prior."""
+        if isinstance(self.encoder, DynamicEncoder):
+            prior, posterior = self.encoder(states)
+            return posterior, prior
+        return self.encoder(states), self.fixed_prior
+
+    def past_logits(self, states: Tensor) -> Tensor:
+        """(B, T, N, N, K): what is known of the graph at each step from the steps so far: dnri's prior, and nri's
+        posterior given those steps.
+        """
+        if isinstance(self.encoder, DynamicEncoder):
+            return self.encoder.prior(states)[0]
+        return self.encoder.running(states)
+
+    def sample(self, logits: Tensor, noise: Tensor) -> Tensor:
+        """One-hot graphs, straight-through."""
+        return sample_graph(logits, noise, self.spec.temperature)
+
+    def draw_noise(self, batch: int, steps: int, agents: int, generator: torch.Generator) -> Tensor:
+        """Gumbel noise for the graphs of `batch` trajectories."""
+        return self.graph_noise.draw(batch, steps, agents, self.spec.edge_types, generator)
+
+
+@dataclass(frozen=True)
+class VariationalPredictor:
+    """Sampled graphs, and the decoder's mean under each. `deterministic` takes the most likely graph instead."""
+
+    model: VariationalModel
+    integrator: Integrator
+
+    @torch.no_grad()
+    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+        """See Predictor. dnri's graphs are drawn from its prior; nri's one graph from its posterior given the start."""
+        was_training = self.model.training
+        self.model.eval()
+        b, n, _ = start.shape
+        noise = self.model.draw_noise(b, steps, n, generator).to(start.device) * (not deterministic)
+        state, edge_memory, memory = start.unsqueeze(1), None, None
+        graph = None if self.model.dynamic else self.model.sample(self.model.past_logits(state), noise)
+        states = [state]
+        for t in range(steps):
+            if isinstance(self.model.encoder, DynamicEncoder):
+                logits, edge_memory = self.model.encoder.prior(state, edge_memory)
+                graph = self.model.sample(logits, noise[:, t : t + 1])
+            action, memory = self.model.decoder(state, graph, memory)
+            state = self.integrator.step(state, action)
+            states.append(state)
+        self.model.train(was_training)
+        return torch.cat(states, dim=1)
+
+    @torch.no_grad()
+    def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """See Predictor. Under graphs sampled from what the past tells of them."""
+        was_training = self.model.training
+        self.model.eval()
+        now = states[:, :-1]
+        noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
+        graphs = self.model.sample(self.model.past_logits(now), noise)
+        action, _ = self.model.decoder(now, graphs)
+        self.model.train(was_training)
+        return self.integrator.step(now, action)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "VariationalPredictor":
+        return VariationalPredictor(deepcopy(self.model, memo), self.integrator)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights and batch statistics."""
+        return self.model.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> object:
+        """Inverse of `state_dict`."""
+        return self.model.load_state_dict(state)
+
+
+class VariationalLearner:
+    """The negative evidence lower bound on batches of whole expert trajectories.
+
+    The decoder's inputs are the expert's states where the curriculum intervenes (always, by default: teacher forcing),
+    and its own predictions elsewhere, through which the gradient flows.
+    """
+
+    def __init__(self, setting: Setting) -> None:
+        spec = setting.spec
+        self.setting, self.variational, self.cloning = setting, used(spec.variational), used(spec.cloning)
+        self.curriculum, self.training = used(spec.curriculum), used(spec.training)
+        self.generators, self.device = setting.generators, setting.device
+        state_size, action_size = setting.experts.states.shape[-1], setting.experts.actions.shape[-1]
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.generators.seeds["weights"])
+            model = VariationalModel(state_size, action_size, self.variational, dynamic=spec.method == "dnri")
+        self.model = model.to(self.device)
+        self.predictor = VariationalPredictor(self.model, setting.integrator)
+        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=self.cloning.learning_rate, fused=True)
+        self.rates = DecayingRates(
+            self.training, {"model": self.optimizer}, {"model": self.cloning.learning_rate_final}
+        )
+
+    def networks(self) -> list[nn.Module]:
+        """The model."""
+        return [self.model]
+
+    def run_epoch(self, epoch: int) -> dict[str, float]:
+        """training.updates gradient steps under the curriculum."""
+        self.rates.set(epoch)
+        frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
+        values = mean_of([self._update(frequency) for _ in range(self.training.updates)])
+        return values | {
+            "curriculum/intervention_frequency": frequency,
+            "curriculum/expected_segment_length": expected_segment_length(frequency, self.setting.steps),
+        }
+
+    def _update(self, frequency: float) -> dict[str, float]:
+        experts, b = self.setting.experts, self.training.batch
+        batch = experts[torch.randint(len(experts), (b,), generator=self.generators["data"]).to(self.device)]
+        states = batch.states[:, :-1]
+        interventions = draw_interventions(b, states.shape[1], frequency, self.generators["curriculum"])
+        posterior, prior = self.model.posterior(states)
+        noise = self.model.draw_noise(b, states.shape[1], states.shape[2], self.generators["policy"])
+        graphs = self.model.sample(posterior, noise.to(self.device))
+        predicted = self._decode(self._noisy(states), graphs, interventions.to(self.device))
+        loss, terms = variational_loss(
+            predicted,
+            batch.states[:, 1:],
+            posterior,
+            prior,
+            variance=self.variational.variance,
+            kl_weight=self.variational.kl_weight,
+        )
+        clipped_step(self.optimizer, loss, self.model.parameters(), self.training.gradient_clip)
+        logs = {f"cloning/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
+        return logs | {"curriculum/segment_length": mean_segment_length(interventions)}
+
+    def _noisy(self, states: Tensor) -> Tensor:
+        noise = torch.randn(states.shape, generator=self.generators["data"]).to(self.device)
+        return states + self.cloning.input_noise * noise
+
+    def _decode(self, states: Tensor, graphs: Tensor, interventions: Tensor) -> Tensor:
+        """Predicted next states (B, T, N, D); all steps at once where every input is the expert's."""
+        integrator, decoder = self.setting.integrator, self.model.decoder
+        if bool(interventions[:, 1:].all()):
+            return integrator.step(states, decoder(states, graphs)[0])
+        b, steps = interventions.shape
+        graphs = graphs.expand(-1, steps, -1, -1, -1)
+        predicted: list[Tensor] = []
+        memory: Tensor | None = None
+        for t in range(steps):
+            given = states[:, t : t + 1]
+            if t:
+                given = torch.where(interventions[:, t].view(b, 1, 1, 1), given, predicted[-1])
+            action, memory = decoder(given, graphs[:, t : t + 1], memory)
+            predicted.append(integrator.step(given, action))
+        return torch.cat(predicted, dim=1)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Weights, batch statistics and optimiser."""
+        return {"model": self.model.state_dict(), "optimizer": self.optimizer.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        self.model.load_state_dict(state["model"])
+        self.optimizer.load_state_dict(state["optimizer"])
