@@ -1,0 +1,97 @@
+"""nri and dnri: what their decoders are given, and that they learn."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+
+from ssmail.experiments import build_spec
+from ssmail.training.loop import TrainingLoop
+from ssmail.training.variational import VariationalLearner
+
+
+def learner(method: str = "dnri", *overrides: str) -> VariationalLearner:
+    made = TrainingLoop(build_spec(method, "yjunction", "smoke", overrides), 0).learner
+    assert isinstance(made, VariationalLearner)
+    return made
+
+
+def graphs_of(made: VariationalLearner, states: torch.Tensor) -> torch.Tensor:
+    logits, _ = made.model.posterior(states)
+    return made.model.sample(logits, torch.zeros_like(logits)).detach()
+
+
+@pytest.mark.parametrize("method", ["nri", "dnri"])
+@pytest.mark.parametrize("decoder", ["messages", "recurrent"])
+def test_all_steps_at_once_equal_step_by_step(method: str, decoder: str) -> None:
+    """Complete forcing takes the short way; one step without an intervention, the last, forces the long one."""
+    made = learner(method, f"variational.decoder={decoder}")
+    states = made.setting.experts.states[:3, :-1]
+    graphs = graphs_of(made, states)
+    always = torch.ones(3, states.shape[1], dtype=torch.bool)
+    once_free = always.clone()
+    once_free[:, -1] = False
+    at_once, stepwise = (made._decode(states, graphs, mask) for mask in (always, once_free))
+    torch.testing.assert_close(at_once[:, :-1], stepwise[:, :-1], atol=1e-6, rtol=1e-5)
+    assert not torch.allclose(at_once[:, -1], stepwise[:, -1], atol=1e-7)
+
+
+def test_without_interventions_only_the_first_state_is_read() -> None:
+    made = learner("dnri")
+    states = made.setting.experts.states[:2, :-1]
+    graphs = graphs_of(made, states)
+    other = states.clone()
+    other[:, 1:] += 1
+    for frequency, same in ((0.0, True), (1.0, False)):
+        mask = torch.full((2, states.shape[1]), bool(frequency))
+        results = [made._decode(given, graphs, mask) for given in (states, other)]
+        assert torch.equal(*results) is same
+
+
+def test_a_rollout_of_dnri_follows_its_prior_and_nri_keeps_one_graph(monkeypatch: pytest.MonkeyPatch) -> None:
+    for method, drawn in (("nri", 1), ("dnri", 5)):
+        made = learner(method)
+        calls = []
+        sample = type(made.model).sample
+        monkeypatch.setattr(type(made.model), "sample", lambda *a, s=sample, c=calls: (c.append(1), s(*a))[1])
+        made.predictor.free_run(made.setting.experts.states[:2, 0], 5, torch.Generator())
+        monkeypatch.undo()
+        assert len(calls) == drawn
+
+
+def test_predicting_leaves_the_model_in_training_mode_and_its_statistics_alone() -> None:
+    made = learner()
+    before = deepcopy(made.model.state_dict())
+    made.predictor.free_run(made.setting.experts.states[:2, 0], 3, torch.Generator())
+    made.predictor.one_step(made.setting.experts.states[:2], torch.Generator())
+    assert made.model.training
+    for name, value in made.model.state_dict().items():
+        assert torch.equal(value, before[name]), name
+    made.run_epoch(0)  # negative control: training does move them
+    assert any(not torch.equal(v, before[n]) for n, v in made.model.state_dict().items() if "running" in n)
+
+
+def test_one_step_prediction_reads_the_past_only() -> None:
+    for method in ("nri", "dnri"):
+        made = learner(method)
+        states = made.setting.experts.states[:2]
+        other = states.clone()
+        other[:, 20:] += 0.5
+        first, second = (made.predictor.one_step(s, torch.Generator().manual_seed(0)) for s in (states, other))
+        torch.testing.assert_close(first[:, :20], second[:, :20])
+        assert not torch.allclose(first[:, 20:], second[:, 20:])
+
+
+@pytest.mark.parametrize("method", ["bc", "nri", "dnri"])
+def test_a_little_training_beats_constant_velocity_by_one_step(method: str) -> None:
+    """Test trajectories, clearly better; negative control: with a learning rate of nothing it does not."""
+    for rate, learns in ((0.003, True), (1e-9, False)):
+        chosen = [f"cloning.learning_rate={rate}", "training.epochs=3", "training.updates=40", "training.batch=16"]
+        chosen += ["data.yjunction.train=64"]
+        chosen += ["variational.hidden=16", "variational.decoder_hidden=32"] if method != "bc" else ["model.hidden=16"]
+        loop = TrainingLoop(build_spec(method, "yjunction", "smoke", chosen), 0)
+        for _ in range(loop.spec.epochs):
+            loop.run_epoch()
+        values, _ = loop.final_evaluation()
+        ratio = values["test_last/one_step_mse"] / values["test_constant_velocity/one_step_mse"]
+        assert (ratio < 0.92) is learns, ratio
