@@ -3,12 +3,15 @@
 import csv
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
+
+from ssmail.errors import InputError, SsmailError
 
 Row = Mapping[str, Any]
 
@@ -31,6 +34,16 @@ def chosen_format(as_json: bool, chosen: Format | None) -> Format:
 def note(text: str) -> None:
     """A remark beside the result: one line on stderr."""
     print(text, file=sys.stderr)
+
+
+def complaint(error: Exception) -> str:
+    """What to tell of an error in one line. With SSMAIL_DEBUG=1 an error that nobody foresaw is raised again."""
+    if isinstance(error, SsmailError):
+        return str(error)
+    if os.environ.get("SSMAIL_DEBUG"):
+        raise error
+    what = " ".join(str(error).split())
+    return f"unexpected {type(error).__name__}: {what} (SSMAIL_DEBUG=1 shows the traceback)"
 
 
 def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
@@ -115,8 +128,6 @@ def _json_value(value: Any) -> Any:
 
 
 def _to(out: Path | None, write: Any) -> None:
-    from ssmail.errors import InputError
-
     if out is None:
         write(sys.stdout)
         return

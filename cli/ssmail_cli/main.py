@@ -10,7 +10,8 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
-from ssmail_cli import data, plot, runs, train
+from ssmail_cli import ablate, data, plot, reproduce, runs, train
+from ssmail_cli.display import complaint
 
 INTERRUPTED = 130
 
@@ -24,6 +25,9 @@ app = typer.Typer(
 )
 app.command("generate-yjunction")(data.generate_yjunction)
 app.command("train")(train.train)
+app.command("ablate")(ablate.ablate)
+app.command("ablate-beta")(ablate.alias("beta"))
+app.command("reproduce")(reproduce.reproduce)
 app.command("plot")(plot.plot)
 app.add_typer(runs.app, name="runs")
 
@@ -63,10 +67,7 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
             return _complain(_usage(error.format_message()), 2)
-        if os.environ.get("SSMAIL_DEBUG"):
-            raise
-        what = " ".join(str(error).split())
-        return _complain(f"unexpected {type(error).__name__}: {what} (SSMAIL_DEBUG=1 shows the traceback)", 1)
+        return _complain(complaint(error), 1)
     return code if isinstance(code, int) else 0
 
 

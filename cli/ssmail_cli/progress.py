@@ -1,18 +1,19 @@
-"""How training shows itself on stderr: a live line for each seed on a terminal, a few log lines elsewhere."""
+"""How a sweep shows itself on stderr: live lines on a terminal, a few log lines elsewhere."""
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ssmail_cli.display import note
+from ssmail_cli.display import note, short
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.progress import Progress, TaskID
 
-    from ssmail.execution.local import Event
+    from ssmail.execution.local import Cell, Event
 
+Sweep = Mapping["Cell", Mapping[str, Any]]  # what each cell is called; see ssmail_cli.sweep
 Report = Callable[["Event"], None]
 
 LABELS = {
@@ -22,31 +23,42 @@ LABELS = {
     "actor/loss": "actor",
 }
 LOG_LINES = 10  # of the epochs of one run
+FEW = 10  # so many cells have a line each from the beginning, and a log of their epochs
+
+
+def label(names: Mapping[str, Any]) -> str:
+    """{"method": "ssail", "beta": 0.15, "seed": 2} -> "ssail, beta 0.15, seed 2"."""
+    return ", ".join(short(value) if name == "method" else f"{name} {short(value)}" for name, value in names.items())
 
 
 @contextmanager
-def reporter(seeds: Sequence[int], epochs: int) -> Iterator[Report]:
-    """A function that shows each Event of the training of these seeds, `epochs` epochs each."""
-    if sys.stderr.isatty():
-        with _live(seeds, epochs) as report:
-            yield report
-    else:
-        yield _Log()
+def reporter(sweep: Sweep) -> Iterator[Report]:
+    """A function that shows each Event of the training of these cells."""
+    labels = {cell: label(names) for cell, names in sweep.items()}
+    if not sys.stderr.isatty():
+        yield _Log(labels)
+        return
+    with _progress() as progress:
+        yield _LineForEach(progress, labels) if len(labels) <= FEW else _RunningOnes(progress, labels)
 
 
 class _Log:
-    """Plain lines: when a run starts and ends, and about LOG_LINES of its epochs."""
+    """Plain lines: when a run starts and ends, and about LOG_LINES of its epochs where there are FEW runs."""
+
+    def __init__(self, labels: "Mapping[Cell, str]") -> None:
+        self._labels, self._ended = labels, 0
 
     def __call__(self, event: "Event") -> None:
-        seed = f"seed {event.cell.seed}"
+        name, few = self._labels[event.cell], len(self._labels) <= FEW
         if event.kind != "epoch":
-            note(f"{seed}: {_headline(event)}")
-        elif event.epoch % max(1, event.epochs // LOG_LINES) == 0 or event.epoch == event.epochs:
-            note(f"{seed}: epoch {event.epoch}/{event.epochs}  {_losses(event.metrics)}")
+            self._ended += event.is_final
+            count = f"  [{self._ended}/{len(self._labels)}]" if event.is_final and not few else ""
+            note(f"{name}: {_headline(event)}{count}")
+        elif few and (event.epoch % max(1, event.epochs // LOG_LINES) == 0 or event.epoch == event.epochs):
+            note(f"{name}: epoch {event.epoch}/{event.epochs}  {_losses(event.metrics)}")
 
 
-@contextmanager
-def _live(seeds: Sequence[int], epochs: int) -> Iterator[Report]:
+def _progress() -> "Progress":
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -57,16 +69,65 @@ def _live(seeds: Sequence[int], epochs: int) -> Iterator[Report]:
         TextColumn("{task.fields[status]}", markup=False),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
-    with Progress(*columns, console=Console(stderr=True), speed_estimate_period=120) as progress:
-        tasks = {seed: progress.add_task(f"seed {seed}", total=epochs, start=False, status="waiting") for seed in seeds}
-
-        def report(event: "Event") -> None:
-            _update(progress, tasks[event.cell.seed], event)
-
-        yield report
+    return Progress(*columns, console=Console(stderr=True), speed_estimate_period=120)
 
 
-def _update(progress: Any, task: "TaskID", event: "Event") -> None:
+class _LineForEach:
+    """A line for each run, waiting, running or ended."""
+
+    def __init__(self, progress: "Progress", labels: "Mapping[Cell, str]") -> None:
+        self._progress = progress
+        self._tasks = {
+            cell: progress.add_task(name, total=cell.spec.epochs, start=False, status="waiting")
+            for cell, name in labels.items()
+        }
+
+    def __call__(self, event: "Event") -> None:
+        _update(self._progress, self._tasks[event.cell], event)
+
+
+class _RunningOnes:
+    """A line for all runs together, whose bar counts their epochs, and below it one for each that is running.
+
+    What need not be computed is taken off the total, so that the time remaining is judged by the work done here.
+    """
+
+    def __init__(self, progress: "Progress", labels: "Mapping[Cell, str]") -> None:
+        self._progress, self._labels = progress, labels
+        self._tasks: dict[Cell, TaskID] = {}
+        self._left, self._ended = sum(cell.spec.epochs for cell in labels), 0
+        self._all = progress.add_task("all", total=self._left, status=self._status())
+
+    def __call__(self, event: "Event") -> None:
+        if event.kind == "epoch":
+            self._progress.advance(self._all)
+            _update(self._progress, self._tasks[event.cell], event)
+        elif event.is_final:
+            self._end(event)
+        else:
+            task = self._progress.add_task(self._labels[event.cell], total=event.epochs, status="")
+            self._tasks[event.cell] = task
+            _update(self._progress, task, event)
+            self._forget(event.epoch)
+
+    def _end(self, event: "Event") -> None:
+        """Turn the line of the run into a line of text above."""
+        self._ended += 1
+        self._progress.console.print(f"{self._labels[event.cell]}: {_headline(event)}", markup=False, highlight=False)
+        if event.cell in self._tasks:
+            self._progress.remove_task(self._tasks.pop(event.cell))
+        self._forget(event.epochs - (0 if event.kind == "skipped" else event.epoch))
+
+    def _forget(self, epochs: int) -> None:
+        """Take epochs that are not to be computed off the total."""
+        self._left -= epochs
+        self._progress.update(self._all, total=self._left, status=self._status())
+
+    def _status(self) -> str:
+        return f"{self._ended} of {len(self._labels)} runs ended"
+
+
+def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
     if event.kind in ("started", "resumed"):
         progress.reset(task, completed=event.epoch, status=_headline(event))
     elif event.kind == "epoch":
@@ -89,4 +150,4 @@ def _headline(event: "Event") -> str:
 
 
 def _losses(metrics: Mapping[str, float]) -> str:
-    return "  ".join(f"{label} {metrics[name]:.3g}" for name, label in LABELS.items() if name in metrics)
+    return "  ".join(f"{word} {metrics[name]:.3g}" for name, word in LABELS.items() if name in metrics)

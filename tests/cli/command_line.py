@@ -1,7 +1,8 @@
-"""The types of the `cli` fixture."""
+"""The types of the fixtures."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 
 @dataclass(frozen=True)
@@ -23,3 +24,4 @@ class Outcome:
 
 
 CommandLine = Callable[..., Outcome]
+FakeTraining = Callable[..., dict[str, Any]]

@@ -1,9 +1,20 @@
-"""The command line in this process, free of the developer's settings."""
+"""The command line in this process, free of the developer's settings, and training that takes no time."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from ssmail.execution import local
+from ssmail.execution.cells import Settings
+from ssmail.execution.local import Cell, Event, Resume
+from ssmail.execution.single import run_cell
+from ssmail.store import RunState, Store
 from ssmail_cli.main import run
-from tests.cli.command_line import CommandLine, Outcome
+from ssmail_cli.progress import Report
+from tests.cli.command_line import CommandLine, FakeTraining, Outcome
+from tests.figures.handmade_arrays import arrays
 
 SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
 
@@ -24,3 +35,63 @@ def cli(capsys: pytest.CaptureFixture[str]) -> CommandLine:
         return Outcome(code, *capsys.readouterr())
 
     return call
+
+
+@pytest.fixture
+def db(tmp_path: Path) -> Path:
+    """Where a database may be made."""
+    return tmp_path / "results" / "ssmail.db"
+
+
+@pytest.fixture
+def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTraining:
+    """fake({seed: kind}) puts another run_cells in place, which ends each seed so ("finished" unless said otherwise).
+
+    It returns the arguments that run_cells is going to get.
+    """
+
+    def install(ends: dict[int, Any] | None = None) -> dict[str, Any]:
+        arguments: dict[str, Any] = {}
+
+        def run_cells(cells: Sequence[Cell], **options: Any) -> list[Event]:
+            arguments.update(options, cells=cells)
+            return [_end(cell, (ends or {}).get(cell.seed, "finished"), options) for cell in cells]
+
+        monkeypatch.setattr(local, "run_cells", run_cells)
+        return arguments
+
+    return install
+
+
+@pytest.fixture
+def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """walk() lets cells be planned, resumed and stored as always, but in this process and by random walks."""
+
+    def run_cells(
+        cells: Sequence[Cell], *, store_url: str, on_event: Report, jobs: int, device: str, resume: Resume
+    ) -> list[Event]:
+        store, settings = Store.open(store_url), Settings(device, resume, loop_factory="tests.execution.fake_loop:Walk")
+        events = []
+        for cell in cells:
+            events.append(run_cell(cell, store, settings, on_event, lambda: False))
+            on_event(events[-1])
+        return events
+
+    return lambda: monkeypatch.setattr(local, "run_cells", run_cells)
+
+
+def _end(cell: Cell, kind: Any, options: dict[str, Any]) -> Event:
+    store, report, epochs = Store.open(options["store_url"]), options["on_event"], cell.spec.epochs
+    writer = store.start_run(cell.spec, cell.seed, dataset_hash="d" * 64, device="cpu", replace=True)
+    report(Event("started", cell, writer.run_id, 0, epochs))
+    for epoch in range(1, epochs + 1):
+        metrics = {"validation/mode_mse": 0.1 / epoch, "critic/loss": 0.5}
+        writer.epoch(epoch, {**metrics, "train/mode_mse": 0.2 / epoch})
+        report(Event("epoch", cell, writer.run_id, epoch, epochs, metrics))
+    if kind == "finished":
+        writer.arrays(arrays(0.0))
+        writer.final(epochs, {"test/mode_mse": 0.001 * (1 + cell.seed), "test/on_lane": 0.9, "test/lane_balance": 0.25})
+    writer.finish(RunState(kind), None if kind == "finished" else "the reason")
+    last = Event(kind, cell, writer.run_id, epochs, epochs, {"test/mode_mse": 0.5}, message="the reason")
+    report(last)
+    return last

@@ -6,61 +6,19 @@ import json
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 
 from ssmail.errors import InputError
 from ssmail.execution import local
-from ssmail.execution.local import Cell, Event, Resume
-from ssmail.store import RunState, Store
-from ssmail_cli.train import MOST_SEEDS, parse_seeds
-from tests.cli.command_line import CommandLine
+from ssmail.execution.local import Resume
+from ssmail.store import Store
+from ssmail_cli.training_options import MOST_SEEDS, parse_seeds
+from tests.cli.command_line import CommandLine, FakeTraining
 
 SMOKE = ("train", "--profile", "smoke", "--device", "cpu")
-
-
-@pytest.fixture
-def db(tmp_path: Path) -> Path:
-    return tmp_path / "results" / "ssmail.db"
-
-
-@pytest.fixture
-def fake(monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
-    """fake({seed: kind}) puts another run_cells in place, which ends each seed so ("finished" unless said otherwise).
-
-    It returns the arguments that run_cells is going to get.
-    """
-
-    def install(ends: dict[int, str] | None = None) -> dict[str, Any]:
-        arguments: dict[str, Any] = {}
-
-        def run_cells(cells: Sequence[Cell], **options: Any) -> list[Event]:
-            arguments.update(options, seeds=[cell.seed for cell in cells], spec=cells[0].spec)
-            return [end(cell, (ends or {}).get(cell.seed, "finished"), options) for cell in cells]
-
-        monkeypatch.setattr(local, "run_cells", run_cells)
-        return arguments
-
-    def end(cell: Cell, kind: Any, options: dict[str, Any]) -> Event:
-        store, report, epochs = Store.open(options["store_url"]), options["on_event"], cell.spec.training.epochs
-        writer = store.start_run(cell.spec, cell.seed, dataset_hash=None, device="cpu", replace=True)
-        report(Event("started", cell, writer.run_id, 0, epochs))
-        for epoch in range(1, epochs + 1):
-            metrics = {"validation/mode_mse": 0.1 / epoch, "critic/loss": 0.5}
-            writer.epoch(epoch, metrics)
-            report(Event("epoch", cell, writer.run_id, epoch, epochs, metrics))
-        if kind == "finished":
-            writer.final(epochs, {"test/mode_mse": 0.001 * (1 + cell.seed)})
-        writer.finish(RunState(kind), None if kind == "finished" else "the reason")
-        last = Event(kind, cell, writer.run_id, epochs, epochs, {"test/mode_mse": 0.5}, message="the reason")
-        report(last)
-        return last
-
-    return install
 
 
 @pytest.mark.parametrize(
@@ -87,7 +45,7 @@ def test_seeds_that_are_none(text: str) -> None:
         parse_seeds(text)
 
 
-def test_the_options_reach_the_training(cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path) -> None:
+def test_the_options_reach_the_training(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     given = fake()
     more = (
         "--seeds",
@@ -102,17 +60,15 @@ def test_the_options_reach_the_training(cli: CommandLine, fake: Callable[..., di
         "training.epochs=4",
     )
     assert cli(*SMOKE, *more, "--db", db).code == 0
-    assert given["seeds"] == [3, 1]
+    assert [cell.seed for cell in given["cells"]] == [3, 1]
     assert given["jobs"] == 2
     assert given["device"] == "cpu"
     assert given["resume"] is Resume.NEVER
     assert Path(given["store_url"].removeprefix("sqlite:///")) == db
-    assert (given["spec"].sac.gamma, given["spec"].training.epochs) == (0.5, 4)
+    assert (given["cells"][0].spec.sac.gamma, given["cells"][0].spec.epochs) == (0.5, 4)
 
 
-def test_results_are_rows_in_the_order_of_the_seeds(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
-) -> None:
+def test_results_are_rows_in_the_order_of_the_seeds(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
     outcome = cli(*SMOKE, "--seeds", "2,0", "--db", db)
     rows = list(csv.DictReader(io.StringIO(outcome.out)))
@@ -121,12 +77,10 @@ def test_results_are_rows_in_the_order_of_the_seeds(
         ("0", "finished", "0.001"),
     ]
     found = json.loads(cli(*SMOKE, "--seeds", "5", "--db", db, "--json").out)
-    assert [(row["seed"], row["test/mode_mse"], row["test/on_lane"]) for row in found] == [(5, 0.006, None)]
+    assert [(row["seed"], row["test/mode_mse"], row["test/min_fde_20"]) for row in found] == [(5, 0.006, None)]
 
 
-def test_without_a_terminal_progress_is_a_few_lines(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
-) -> None:
+def test_without_a_terminal_progress_is_a_few_lines(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
     lines = cli(*SMOKE, "--set", "training.epochs=100", "--db", db).err.splitlines()
     assert lines[0].startswith("seed 0: started (run ")
@@ -136,7 +90,7 @@ def test_without_a_terminal_progress_is_a_few_lines(
 
 
 def test_on_a_terminal_there_is_a_line_for_each_seed(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake({1: "failed"})
     monkeypatch.setenv("COLUMNS", "100")
@@ -148,9 +102,7 @@ def test_on_a_terminal_there_is_a_line_for_each_seed(
     assert "3/3 failed (run " in outcome.err
 
 
-def test_no_color_is_respected(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_color_is_respected(cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake()
     monkeypatch.setenv("TERM", "xterm-256color")
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
@@ -172,7 +124,7 @@ def test_no_color_is_respected(
     ],
 )
 def test_exit_codes(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, ends: dict[int, str], code: int, words: str
+    cli: CommandLine, fake: FakeTraining, db: Path, ends: dict[int, str], code: int, words: str
 ) -> None:
     fake(ends)
     outcome = cli(*SMOKE, "--seeds", "0-1", "--db", db)
@@ -182,7 +134,7 @@ def test_exit_codes(
 
 
 def test_a_diverged_run_is_skipped_but_is_no_success(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path, monkeypatch: pytest.MonkeyPatch
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real = local.run_cells
     fake({0: "diverged"})
@@ -193,9 +145,7 @@ def test_a_diverged_run_is_skipped_but_is_no_success(
     assert outcome.code == 3
 
 
-def test_a_dry_run_tells_what_would_run_and_makes_nothing(
-    cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path
-) -> None:
+def test_a_dry_run_tells_what_would_run_and_makes_nothing(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     def plan(*options: str) -> list[tuple[str, str]]:
         outcome = cli(*SMOKE, "--seeds", "0-2", "--dry-run", "--db", db, *options)
         assert outcome.code == 0
@@ -220,7 +170,7 @@ def test_nothing_to_resume(cli: CommandLine, db: Path, options: list[str]) -> No
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
-def test_cuda_without_a_gpu(cli: CommandLine, fake: Callable[..., dict[str, Any]], db: Path) -> None:
+def test_cuda_without_a_gpu(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     outcome = cli("train", "--profile", "smoke", "--device", "cuda", "--db", db)
     assert (outcome.code, outcome.sentence) == (
         2,

@@ -1,0 +1,105 @@
+"""`ssmail ablate NAME`: one method for several values of one key, with seeds, in one sweep."""
+
+import functools
+import inspect
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Annotated, Any
+
+import typer
+
+from ssmail.errors import InputError
+from ssmail_cli import training_options as options
+from ssmail_cli.display import note
+from ssmail_cli.options import DEFAULT_DATABASE, Database, Json
+from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
+from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
+
+
+def ablate(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="beta or curriculum, or one of your experiments.yaml.")],
+    values: Annotated[
+        str | None,
+        typer.Option(
+            "--values", help="The values, as 0,0.1,0.15; each once.", show_default="those of experiments.yaml"
+        ),
+    ] = None,
+    profile: options.ProfileName = "quick",
+    seeds: options.Seeds = "0-4",
+    jobs: options.Jobs = 1,
+    settings: options.Settings = None,
+    resume: options.ResumeOption = ResumeChoice.AUTO,
+    device: options.DeviceOption = Device.AUTO,
+    dry_run: options.DryRun = False,
+    as_json: Json = False,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Train a method for several values of one setting.
+
+    A run for each value and seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops. Each
+    ablation is an entry of experiments.yaml; `ssmail ablate-beta` is the same as `ssmail ablate beta`.
+    """
+    from ssmail.execution.local import Cell
+    from ssmail.experiments import ablation, ablation_specs
+
+    chosen_seeds = parse_seeds(seeds)
+    column = _column(ablation(name).key)
+    specs = ablation_specs(name, profile, None if values is None else parse_values(values), settings or [])
+    sweep = {Cell(spec, seed): {column: value, "seed": seed} for value, spec in specs.items() for seed in chosen_seeds}
+    if dry_run:
+        print_plan(sweep, db, resume, as_json)
+        return
+    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
+    if sys.stdout.isatty() and not is_interrupted(rows):
+        _point_to_figures(name, db)
+    finish(sweep, rows)
+
+
+def alias(name: str) -> Callable[..., None]:
+    """The command `ablate` with its argument given."""
+
+    @functools.wraps(ablate)
+    def command(**given: Any) -> None:
+        ablate(name, **given)
+
+    signature = inspect.signature(ablate)
+    parameters = [parameter for parameter in signature.parameters.values() if parameter.name != "name"]
+    command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]  # read by Typer
+    command.__doc__ = f"Short for `ssmail ablate {name}`."
+    return command
+
+
+def parse_values(text: str) -> list[Any]:
+    """ "0,0.1" -> [0, 0.1], each part as YAML reads it. Raises InputError where that is nothing."""
+    import yaml
+
+    from ssmail import strict_yaml
+
+    try:
+        values = [strict_yaml.parse(part) for part in text.split(",")]
+    except yaml.YAMLError:
+        values = [None]
+    if None in values:
+        raise InputError(f"--values takes values with commas between them, such as 0,0.15,1, not '{text}'.")
+    return values
+
+
+def _column(key: str) -> str:
+    """What the result table calls the value: the key's last part, or all of it where that would be misread."""
+    from ssmail.store import RunRow
+
+    last = key.rpartition(".")[2]
+    taken = {"name", "run", "outcome", "action", "message", *(field.name for field in fields(RunRow))}
+    return key if last in taken else last
+
+
+def _point_to_figures(name: str, db: str) -> None:
+    """A line for each figure that draws the ablation."""
+    from ssmail.experiments import figure_requirements, load_experiments
+    from ssmail.figures import FIGURES
+
+    where = "" if db == DEFAULT_DATABASE else f" --db {db}"
+    for figure in load_experiments().figures:
+        if figure in FIGURES and figure_requirements(figure).ablation == name:
+            note(f"`ssmail plot {figure}{where}` draws these runs")

@@ -1,0 +1,119 @@
+"""One resumable sweep over cells, for every command that trains: computed, shown as rows, and how the command ends.
+
+A sweep is a dictionary from each cell to its names: what tells it from the other cells, as {"beta": 0.15, "seed": 2}.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from ssmail.errors import InputError
+from ssmail_cli.display import chosen_format, note, print_rows
+from ssmail_cli.options import is_missing
+from ssmail_cli.progress import Sweep, label, reporter
+from ssmail_cli.results import KEY_METRICS, rows_with_metrics
+from ssmail_cli.training_options import ResumeChoice
+
+if TYPE_CHECKING:
+    from ssmail.execution.local import Cell, Event
+    from ssmail.store import Store
+
+SOME_RUNS_FAILED = 3
+INTERRUPTED = 130
+
+RESULT_COLUMNS = {
+    "outcome": "outcome",
+    "run": "run",
+    "test/mode_mse": "mode_mse",
+    "test/on_lane": "on_lane",
+    "test/lane_balance": "balance",
+    "test/min_fde_20": "min_fde_20",
+    "test_constant_velocity/mode_mse": "const. velocity",
+    "wall_seconds": "seconds",
+}
+
+Rows = list[dict[str, Any]]
+
+
+def train_sweep(sweep: Sweep, db: str, jobs: int, resume: ResumeChoice, device: str, as_json: bool) -> Rows:
+    """Compute every cell into the store, print a row for each, and return the rows."""
+    from ssmail.store import Store
+
+    store = Store.open(db)
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
+    print_rows(rows, {**_heading(sweep), **RESULT_COLUMNS}, chosen_format(as_json, None))
+    return rows
+
+
+def compute(store: "Store", sweep: Sweep, jobs: int, resume: ResumeChoice, device: str) -> "list[Event]":
+    """Compute every cell, with its progress on stderr; the final event of each, in the order of the sweep."""
+    from ssmail.execution.local import Resume, run_cells
+
+    with reporter(sweep) as report:
+        return run_cells(
+            list(sweep), store_url=store.url, jobs=jobs, device=device, resume=Resume(resume), on_event=report
+        )
+
+
+def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
+    """A row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
+    runs = store.runs(ids=[event.run_id for event in events if event.run_id])
+    stored = {row["id"]: row for row in rows_with_metrics(store, runs, [*KEY_METRICS, "best_epoch"])}
+    return [
+        {**names, "outcome": event.kind, "message": event.message}
+        | stored.get(event.run_id, {"run": None, "state": None})
+        for names, event in zip(sweep.values(), events, strict=True)
+    ]
+
+
+def is_interrupted(rows: Rows) -> bool:
+    """Whether the sweep was stopped before its end."""
+    return any(row["outcome"] == "interrupted" for row in rows)
+
+
+def finish(sweep: Sweep, rows: Rows) -> None:
+    """End the command: say which runs did not finish, and raise typer.Exit when there are such."""
+    if is_interrupted(rows):
+        note("interrupted; the same command continues where it stopped")
+        raise typer.Exit(INTERRUPTED)
+    unfinished = [(names, row) for names, row in zip(sweep.values(), rows, strict=True) if row["state"] != "finished"]
+    for names, row in unfinished:
+        note(f"{label(names)} {row['outcome']}: {row['message']}")
+    if unfinished:
+        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def print_plan(sweep: Sweep, db: str, resume: ResumeChoice, as_json: bool) -> None:
+    """Print what training would do with each cell, without making a database."""
+    actions = plan(sweep, db, resume)
+    rows = [
+        {**names, "action": action, "run": run and run[:8], "spec_hash": cell.spec.hash()}
+        for (cell, names), (action, run) in zip(sweep.items(), actions.values(), strict=True)
+    ]
+    columns = {**_heading(sweep), "action": "would", "run": "run", "spec_hash": "spec"}
+    print_rows(rows, columns, chosen_format(as_json, None))
+
+
+def plan(sweep: Sweep, db: str, resume: ResumeChoice) -> "dict[Cell, tuple[str, str | None]]":
+    """For each cell "new", "skip" or "resume", and the id of the run that there is; no database is made."""
+    from ssmail.execution.cells import Resume, Settings, plan_cell
+    from ssmail.store import Store
+
+    if is_missing(db):
+        if resume is ResumeChoice.REQUIRE:
+            raise InputError(f"there is no database {db}, so nothing to resume; use --resume auto.")
+        return dict.fromkeys(sweep, ("new", None))
+    store, settings = Store.open(db), Settings(resume=Resume(resume))
+    actions: dict[Cell, tuple[str, str | None]] = {}
+    for cell in sweep:
+        found = plan_cell(store, cell, settings)
+        if found.skipped:
+            actions[cell] = "skip", found.skipped.run_id
+        else:
+            actions[cell] = ("resume", found.row.id) if found.row else ("new", None)
+    return actions
+
+
+def _heading(sweep: Sweep) -> Mapping[str, str]:
+    return {name: name for names in sweep.values() for name in names}

@@ -1,0 +1,167 @@
+"""`ssmail ablate`: the grid of values and seeds, its names, its plan, and what a second call still computes."""
+
+import csv
+import io
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssmail.execution.local import Resume
+from ssmail.experiments import ablation, ablation_specs, load_experiments
+from ssmail.store import Store
+from ssmail_cli.ablate import parse_values
+from ssmail_cli.progress import FEW
+from tests.cli.command_line import CommandLine, FakeTraining
+
+SMOKE = ("ablate", "beta", "--profile", "smoke", "--device", "cpu")
+
+
+def rows(text: str) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [("0,0.1,0.15", [0, 0.1, 0.15]), ("1e-2", [0.01]), (" 1 , 2", [1, 2]), ("a,b-c", ["a", "b-c"])],
+)
+def test_values(text: str, values: list[Any]) -> None:
+    assert parse_values(text) == values
+
+
+def test_a_row_for_each_value_and_seed_under_the_name_of_the_key(
+    cli: CommandLine, fake: FakeTraining, db: Path
+) -> None:
+    given = fake()
+    outcome = cli(*SMOKE, "--values", "0.5,0,0.50", "--seeds", "3,1", "--jobs", 2, "--resume", "never", "--db", db)
+    assert outcome.code == 0
+    assert [(row["beta"], row["seed"], row["test/mode_mse"]) for row in rows(outcome.out)] == [
+        ("0.5", "3", "0.004"),
+        ("0.5", "1", "0.002"),
+        ("0.0", "3", "0.004"),
+        ("0.0", "1", "0.002"),
+    ]
+    specs = ablation_specs("beta", "smoke", [0.5, 0])
+    assert [(cell.spec, cell.seed) for cell in given["cells"]] == [
+        (specs[value], seed) for value in (0.5, 0.0) for seed in (3, 1)
+    ]
+    assert (given["jobs"], given["device"], given["resume"]) == (2, "cpu", Resume.NEVER)
+
+
+def test_the_default_is_the_grid_of_experiments_yaml_with_five_seeds(
+    cli: CommandLine, fake: FakeTraining, db: Path
+) -> None:
+    outcome = cli(*SMOKE, "--dry-run", "--json", "--db", db)
+    found = [(row["beta"], row["seed"]) for row in json.loads(outcome.out)]
+    assert found == [(value, seed) for value in ablation("beta").values for seed in range(5)]
+    assert not db.parent.exists()
+
+
+def test_settings_reach_every_value(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
+    given = fake()
+    cli(*SMOKE, "--values", "0,1", "--seeds", "0", "--set", "sac.gamma=0.5", "--db", db)
+    assert [(cell.spec.sac.gamma, cell.spec.curriculum.beta) for cell in given["cells"]] == [(0.5, 0.0), (0.5, 1.0)]
+
+
+def test_the_short_name_is_the_same_command(cli: CommandLine, db: Path) -> None:
+    options = ("--profile", "smoke", "--values", "0.25,0.75", "--seeds", "1-2", "--dry-run", "--db", db)
+    long, short = cli("ablate", "beta", *options), cli("ablate-beta", *options)
+    assert long.code == 0
+    assert long == short
+    assert len(rows(long.out)) == 4
+
+
+def test_a_last_part_that_says_little_is_not_used_alone(cli: CommandLine, db: Path) -> None:
+    outcome = cli("ablate", "curriculum", "--profile", "smoke", "--seeds", "0", "--dry-run", "--db", db)
+    assert [row["curriculum.name"] for row in rows(outcome.out)] == list(ablation("curriculum").values)
+
+
+def test_an_ablation_of_ones_own(cli: CommandLine, tmp_path: Path, db: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = load_experiments().path.read_text()
+    mine = "  size: {method: ssail, environment: yjunction, key: model.hidden, values: [4, 8]}\n"
+    (tmp_path / "mine.yaml").write_text(text.replace("\nablations:\n", f"\nablations:\n{mine}"))
+    monkeypatch.setenv("SSMAIL_EXPERIMENTS", str(tmp_path / "mine.yaml"))
+    outcome = cli("ablate", "size", "--profile", "smoke", "--seeds", "0", "--dry-run", "--db", db)
+    assert [row["hidden"] for row in rows(outcome.out)] == ["4", "8"]
+
+
+@pytest.mark.parametrize(
+    ("ends", "code", "words"),
+    [
+        ({}, 0, "finished"),
+        ({1: "failed"}, 3, "beta 0.5, seed 1 failed: the reason"),
+        ({0: "diverged"}, 3, "beta 0.5, seed 0 diverged: the reason"),
+        ({0: "failed", 1: "interrupted"}, 130, "the same command continues"),
+    ],
+)
+def test_exit_codes(
+    cli: CommandLine, fake: FakeTraining, db: Path, ends: dict[int, str], code: int, words: str
+) -> None:
+    fake(ends)
+    outcome = cli(*SMOKE, "--values", "0.5", "--seeds", "0-1", "--db", db)
+    assert outcome.code == code
+    assert words in outcome.err.splitlines()[-1]
+    assert len(rows(outcome.out)) == 2
+
+
+def test_progress_says_which_value_and_which_seed(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
+    fake()
+    few = cli(*SMOKE, "--values", "0.1,0.2", "--seeds", "0-1", "--db", db).err.splitlines()
+    assert few[0].startswith("beta 0.1, seed 0: started (run ")
+    assert few[1] == "beta 0.1, seed 0: epoch 1/3  val 0.1  critic 0.5"
+    assert few[-1].startswith("beta 0.2, seed 1: finished (run ")
+    many = cli(*SMOKE, "--values", "0.3,0.4", "--seeds", f"0-{FEW // 2}", "--db", db).err.splitlines()
+    assert len(many) == 2 * 2 * (FEW // 2 + 1)  # a line for the start and one for the end of each run
+    assert many[-1].endswith(f"[{FEW + 2}/{FEW + 2}]")
+
+
+def test_on_a_terminal_many_runs_have_one_line_together(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake({0: "failed"})
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    outcome = cli(*SMOKE, "--values", "0.3,0.4", "--seeds", f"0-{FEW // 2}", "--db", db)
+    assert f"{FEW + 2} of {FEW + 2} runs ended" in outcome.err
+    assert f"{3 * (FEW + 2)}/{3 * (FEW + 2)}" in outcome.err  # epochs
+    assert "beta 0.4, seed 0: failed (run " in outcome.err
+    assert "waiting" not in outcome.err
+    assert outcome.code == 3
+
+
+def test_on_a_terminal_the_figure_is_named(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    options = (*SMOKE, "--values", "0.5", "--seeds", "0", "--db", db)
+    monkeypatch.setattr("ssmail.figures.FIGURES", {"fig6": None})
+    assert "ssmail plot" not in cli(*options).err
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    assert f"`ssmail plot fig6 --db {db}` draws these runs" in cli(*options).err
+    fake({0: "interrupted"})
+    assert "ssmail plot" not in cli(*options).err
+
+
+def test_a_second_call_computes_only_what_is_missing(
+    cli: CommandLine, fake: FakeTraining, walk: Callable[[], None], db: Path
+) -> None:
+    fake()
+    options = ("--seeds", "0-1", "--db", db)
+    cli(*SMOKE, "--values", "0.1", *options)
+    stored = {run.id for run in Store.open(db).runs()}
+    fake({0: "interrupted"})
+    cli(*SMOKE, "--values", "0.2", "--seeds", "0", "--db", db)
+
+    planned = cli(*SMOKE, "--values", "0.1,0.2", *options, "--dry-run")
+    assert [row["action"] for row in rows(planned.out)] == ["skip", "skip", "resume", "new"]
+    walk()
+    outcome = cli(*SMOKE, "--values", "0.1,0.2", *options)
+    assert outcome.code == 0
+    assert [row["outcome"] for row in rows(outcome.out)] == ["skipped", "skipped", "finished", "finished"]
+    assert outcome.err.count(": started (run ") + outcome.err.count(": resumed after epoch ") == 2
+    runs = Store.open(db).runs()
+    assert stored < {run.id for run in runs}
+    assert [run.state for run in runs] == ["finished"] * 4
