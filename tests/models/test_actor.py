@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.distributions import AffineTransform, Independent, Normal, TanhTransform, TransformedDistribution
 
-from ssmail.models.actor import Actor
+from ssmail.models.actor import EDGE, Actor
 from tests.models.test_message_passing import SPEC, one_hot_graph
 
 
@@ -64,3 +64,49 @@ def test_the_untrained_policy_drives_nearly_straight_on() -> None:
     actor, velocity = Actor(4, 2, SPEC), torch.rand(4, 1, 3, 2)
     action = actor.sample(torch.rand(4, 1, 3, 4), one_hot_graph(4, 1, 3), velocity, torch.zeros(4, 1, 3, 2))
     assert float((action - velocity).detach().abs().max()) < 0.1 * SPEC.action_step
+
+
+@given(seed=st.integers(0, 1000))
+def test_log_probability_of_a_given_action_is_that_of_its_sample(seed: int) -> None:
+    actor, x, graph, velocity, noise = inputs(seed)
+    noise = 0.5 * noise
+    action, expected = actor.sample_with_log_prob(x, graph, velocity, noise)
+    inner = SPEC.action_bound - SPEC.action_step
+    reached = ((action - velocity.clamp(-inner, inner)) / SPEC.action_step).abs().amax(dim=-1)
+    inside = reached < 0.99
+    log_prob = actor.log_prob(x, graph, velocity, action)
+    torch.testing.assert_close(log_prob[inside], expected[inside], rtol=1e-3, atol=1e-3)
+    other = actor.log_prob(x, graph, velocity, action + 0.1 * SPEC.action_step)  # negative control
+    assert not torch.allclose(other[inside], expected[inside], rtol=1e-3, atol=1e-3)
+
+
+def test_log_probability_at_the_edge_and_beyond_is_finite_and_draws_the_mean_there() -> None:
+    actor, x, graph, velocity, _ = inputs()
+    inner = SPEC.action_bound - SPEC.action_step
+    centre = velocity.clamp(-inner, inner)
+    for share in (0.9999, 1.0, 50.0):
+        for sign in (1, -1):
+            actor.zero_grad()
+            log_prob = actor.log_prob(x, graph, velocity, centre + sign * share * SPEC.action_step)
+            assert bool(log_prob.isfinite().all())
+            at_edge = actor.log_prob(x, graph, velocity, centre + sign * EDGE * SPEC.action_step)
+            torch.testing.assert_close(log_prob, at_edge, rtol=1e-3, atol=1e-3)
+            (-log_prob.mean()).backward()
+            last = actor.head[-1]
+            assert isinstance(last, torch.nn.Linear)
+            assert last.bias.grad is not None
+            assert bool((last.bias.grad[:2] * sign < 0).all())  # a descent step moves the mean towards the action
+
+
+def test_log_probability_is_a_density() -> None:
+    """One axis of one agent: it integrates to 1 over the reachable actions."""
+    torch.manual_seed(0)
+    actor = Actor(4, 1, SPEC)
+    x, graph, velocity = torch.randn(1, 1, 4), one_hot_graph(1, 1, 1)[0], torch.zeros(1, 1, 1)
+    with torch.no_grad():
+        low, high = -EDGE * SPEC.action_step, EDGE * SPEC.action_step
+        a = torch.linspace(low, high, 4001).view(-1, 1, 1)
+        density = actor.log_prob(
+            x.expand(4001, -1, -1), graph.expand(4001, -1, -1, -1), velocity.expand(4001, -1, -1), a
+        ).exp()
+    assert abs(float(torch.trapezoid(density.flatten(), a.flatten())) - 1) < 1e-2

@@ -10,6 +10,8 @@ from torch import Tensor, nn
 from ssmail.models.message_passing import TypedMessages, perceptron
 from ssmail.spec import ModelSpec
 
+EDGE = 0.999  # of the action's range: where log_prob takes actions at the edge to be (atanh is exact to 1e-4 there)
+
 
 class Actor(nn.Module):
     """a = c + d * tanh(u), u ~ N(mean, std): c is the current velocity, kept so far inside the bound that |a| <=
@@ -51,11 +53,29 @@ class Actor(nn.Module):
         """
         mean, log_std = self.distribution(x, graph)
         u = mean + log_std.exp() * noise
-        gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
-        jacobian = math.log(self.step) + 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
-        return self.squash(u, velocity), (gaussian - jacobian).sum(dim=-1)
+        return self.squash(u, velocity), self._log_density(u, noise, log_std)
+
+    def log_prob(self, x: Tensor, graph: Tensor, velocity: Tensor, action: Tensor) -> Tensor:
+        """Log-probabilities (..., N) of given actions (..., N, A), as in `sample_with_log_prob`.
+
+        The current velocity limits the actions within reach; their density is ill-conditioned at the edge of that range
+        and 0 beyond. An action past EDGE of the range counts as the one at EDGE: the result is finite, and its gradient
+        still draws the mean to that side.
+        """
+        mean, log_std = self.distribution(x, graph)
+        u = torch.atanh(((action - self._centre(velocity)) / self.step).clamp(-EDGE, EDGE))
+        return self._log_density(u, (u - mean) * torch.exp(-log_std), log_std)
 
     def squash(self, u: Tensor, velocity: Tensor) -> Tensor:
         """The action of an unsquashed u."""
+        return self._centre(velocity) + self.step * torch.tanh(u)
+
+    def _centre(self, velocity: Tensor) -> Tensor:
         inner = self.bound - self.step
-        return velocity.clamp(-inner, inner) + self.step * torch.tanh(u)
+        return velocity.clamp(-inner, inner)
+
+    def _log_density(self, u: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
+        """log p(a) of the action of u = mean + std * noise, summed over the axes."""
+        gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
+        jacobian = math.log(self.step) + 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
+        return (gaussian - jacobian).sum(dim=-1)

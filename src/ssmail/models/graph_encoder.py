@@ -39,22 +39,26 @@ class GraphEncoder(nn.Module):
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
         sequences = off_diagonal(edges).transpose(1, 2).reshape(b * n * (n - 1), t, -1)
-        embedded, memory = self._remember(sequences, memory)
+        embedded, memory = remember(self.lstm, sequences, memory)
         logits = self.head(embedded).view(b, n * (n - 1), t, -1).transpose(1, 2)
         return on_diagonal(logits, n), memory
 
-    def _remember(self, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
-        """The LSTM over (edges, T, H). A single step, as in a rollout, takes the cell itself, which costs half as
-        much.
-        """
-        if sequences.shape[1] > 1:
-            embedded, (hidden, cell) = self.lstm(sequences, memory)
-            return embedded, (hidden, cell)
-        if memory is None:
-            zeros = sequences.new_zeros(1, sequences.shape[0], self.lstm.hidden_size)
-            memory = (zeros, zeros)
-        hidden, cell = torch.lstm_cell(sequences[:, 0], [m[0] for m in memory], *self.lstm.all_weights[0])
-        return hidden.unsqueeze(1), (hidden.unsqueeze(0), cell.unsqueeze(0))
+
+def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
+    """A one-layer LSTM over (edges, T, D) -> (edges, T, H) and its memory. A single step, as in a rollout, takes the
+    cell itself, which costs half as much; without edges there is nothing to do.
+    """
+    edges, steps, _ = sequences.shape
+    if memory is None:
+        zeros = sequences.new_zeros(1, edges, lstm.hidden_size)
+        memory = (zeros, zeros)
+    if not edges:
+        return sequences.new_zeros(0, steps, lstm.hidden_size), memory
+    if steps > 1:
+        embedded, (hidden, cell) = lstm(sequences, memory)
+        return embedded, (hidden, cell)
+    hidden, cell = torch.lstm_cell(sequences[:, 0], [m[0] for m in memory], *lstm.all_weights[0])
+    return hidden.unsqueeze(1), (hidden.unsqueeze(0), cell.unsqueeze(0))
 
 
 def off_diagonal(pairs: Tensor) -> Tensor:

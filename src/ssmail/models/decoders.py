@@ -1,0 +1,114 @@
+"""The decoders of NRI and DNRI: the next velocity of each agent under a graph (Kipf et al. 2018, section 3.2).
+
+Each edge type has its own message perceptron, the messages of an agent are averaged over its senders, and the result is
+a residual on the agent's current velocity: untrained, a decoder is close to constant velocity. The original predicts a
+residual on the whole state; here the environment integrates the velocity (docs/paper.md), so that the position follows.
+
+Inputs x (B, T, N, F) begin with the state [position, velocity] of 2 * A features. Graphs are (B, T, N, N, K), sender
+first; their diagonal is ignored, and T may be 1: one graph for all steps.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.models.edge_perceptron import Activation, EdgePerceptron, graph_edges
+from ssmail.spec import VariationalSpec
+
+
+class TypedEdgeMessages(nn.Module):
+    """mean over senders i of sum_k z_ijk f_k([x_i, x_j]), with an activation after both layers of f_k. With
+    `first_type_is_none` the first type has no perceptron and carries nothing.
+    """
+
+    def __init__(self, inputs: int, spec: VariationalSpec, activation: Activation) -> None:
+        super().__init__()
+        self.skipped = int(spec.first_type_is_none)
+        self.size = spec.decoder_hidden
+        self.types = nn.ModuleList(
+            EdgePerceptron(inputs, self.size, activation) for _ in range(spec.edge_types - self.skipped)
+        )
+
+    def weights(self, graph: Tensor) -> Tensor:
+        """(B, T, N, N, K) -> the weight of each edge's message of each type, (B, T, N, N - 1, K or K - 1)."""
+        return graph_edges(graph)[..., self.skipped :] / max(graph.shape[2] - 1, 1)
+
+    def forward(self, x: Tensor, weights: Tensor) -> Tensor:
+        """x (B, T, N, D) and `weights` of the same steps or of one -> (B, T, N, H)."""
+        received = x.new_zeros(*x.shape[:-1], self.size)
+        for kind, function in enumerate(self.types):
+            received = received + (function(x) * weights[..., kind : kind + 1]).sum(dim=-2)
+        return received
+
+
+def motion_head(inputs: int, hidden: int, action_size: int) -> nn.Sequential:
+    """Three layers, the last one small at first: (..., inputs) -> (..., A)."""
+    last = nn.Linear(hidden, action_size)
+    with torch.no_grad():
+        last.weight.mul_(0.1)
+        last.bias.zero_()
+    return nn.Sequential(nn.Linear(inputs, hidden), nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), last)
+
+
+class MessageDecoder(nn.Module):
+    """For small systems: messages on the inputs of the two agents, nothing remembered."""
+
+    def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
+        super().__init__()
+        self.action_size = action_size
+        self.messages = TypedEdgeMessages(inputs, spec, torch.relu)
+        self.head = motion_head(inputs + spec.decoder_hidden, spec.decoder_hidden, action_size)
+
+    def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, None]:
+        """x (B, T, N, F), graph (B, T or 1, N, N, K) -> next velocities (B, T, N, A), all steps at once. `memory` is
+        that of RecurrentDecoder; here it is always None.
+        """
+        received = self.messages(x, self.messages.weights(graph))
+        a = self.action_size
+        return x[..., a : 2 * a] + self.head(torch.cat([x, received], dim=-1)), None
+
+
+class RecurrentDecoder(nn.Module):
+    """For motion: messages on the hidden states of the two agents, and a gated update of each hidden state h.
+
+    With m the messages: reset r = s(W_r x + V_r m), update z = s(W_z x + V_z m), candidate c = tanh(W_c x + r V_c m),
+    h <- (1 - z) c + z h; s is the logistic function. Unlike in a GRU, h enters the gates through the messages only, as
+    in NRI.
+    """
+
+    def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
+        super().__init__()
+        self.action_size, self.size = action_size, spec.decoder_hidden
+        self.messages = TypedEdgeMessages(self.size, spec, torch.tanh)
+        self.inputs = nn.Linear(inputs, 3 * self.size)
+        self.received = nn.Linear(self.size, 3 * self.size, bias=False)
+        self.head = motion_head(self.size, self.size, action_size)
+
+    def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """x (B, T, N, F), graph (B, T or 1, N, N, K) -> next velocities (B, T, N, A), step after step from the hidden
+        states `memory` (B, N, H; None: zeros), and the hidden states after the last step.
+        """
+        b, t, n, _ = x.shape
+        weights = self.messages.weights(graph).expand(b, t, -1, -1, -1)
+        from_inputs = self.inputs(x)
+        hidden = x.new_zeros(b, n, self.size) if memory is None else memory
+        states = []
+        for step in range(t):
+            hidden = self._update(hidden, from_inputs[:, step], weights[:, step : step + 1])
+            states.append(hidden)
+        a = self.action_size
+        return x[..., a : 2 * a] + self.head(torch.stack(states, dim=1)), hidden
+
+    def _update(self, hidden: Tensor, from_inputs: Tensor, weights: Tensor) -> Tensor:
+        """One step of all hidden states (B, N, H)."""
+        received = self.received(self.messages(hidden.unsqueeze(1), weights).squeeze(1))
+        gates = torch.sigmoid(from_inputs[..., : 2 * self.size] + received[..., : 2 * self.size])
+        reset, update = gates.chunk(2, dim=-1)
+        candidate = torch.tanh(from_inputs[..., 2 * self.size :] + reset * received[..., 2 * self.size :])
+        return candidate + update * (hidden - candidate)
+
+
+def make_decoder(inputs: int, action_size: int, spec: VariationalSpec) -> MessageDecoder | RecurrentDecoder:
+    """The decoder that `spec` names, for F = `inputs` features of each agent."""
+    if spec.decoder == "messages":
+        return MessageDecoder(inputs, action_size, spec)
+    return RecurrentDecoder(inputs, action_size, spec)
