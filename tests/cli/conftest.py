@@ -55,7 +55,8 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> FakeTraining:
 
         def run_cells(cells: Sequence[Cell], **options: Any) -> list[Event]:
             arguments.update(options, cells=cells)
-            return [_end(cell, (ends or {}).get(cell.seed, "finished"), options) for cell in cells]
+            store, report = Store.open(options["store_url"]), options["on_event"]
+            return [_end(cell, (ends or {}).get(cell.seed, "finished"), store, report) for cell in cells]
 
         monkeypatch.setattr(local, "run_cells", run_cells)
         return arguments
@@ -80,8 +81,8 @@ def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     return lambda: monkeypatch.setattr(local, "run_cells", run_cells)
 
 
-def _end(cell: Cell, kind: Any, options: dict[str, Any]) -> Event:
-    store, report, epochs = Store.open(options["store_url"]), options["on_event"], cell.spec.epochs
+def _end(cell: Cell, kind: Any, store: Store, report: Report) -> Event:
+    epochs = cell.spec.epochs
     writer = store.start_run(cell.spec, cell.seed, dataset_hash="d" * 64, device="cpu", replace=True)
     report(Event("started", cell, writer.run_id, 0, epochs))
     for epoch in range(1, epochs + 1):
