@@ -135,7 +135,7 @@ def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     known = [value for value in each if value is not None]
     total = total_seconds(known, jobs)
     if len(known) == len(each):
-        return {"seconds": total, "time": f"about {duration(total)}" if each else "none"}
+        return {"seconds": round(total, 1), "time": f"about {duration(total)}" if each else "none"}
     return {"seconds": None, "time": f"more than {duration(total)}" if known else "unknown"}
 
 
@@ -169,7 +169,10 @@ def _draw(
 
 
 def _ids(name: str, cells: Sweep, ended: "dict[Cell, str]") -> list[str]:
+    """The runs that the figure is drawn from."""
     ids = [ended[cell] for cell in cells if cell in ended]
     if not ids:
         raise InputError("none of its runs finished.")
+    if len(ids) < len(cells):
+        note(f"{name}: {len(cells) - len(ids)} of its {len(cells)} runs are missing: not finished.")
     return ids

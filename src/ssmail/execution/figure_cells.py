@@ -31,7 +31,7 @@ def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[
     """How long one run of each spec takes, judged by finished runs: the median of those of the spec, in seconds.
 
     Without one, the median seconds for each update of the runs of the same method, environment and profile, times the
-    spec's updates; None without those too.
+    spec's updates; None without those too. The start of a process, some seconds, is not counted.
     """
     same: dict[str, list[float]] = {}
     alike: dict[tuple[str, str, str], list[float]] = {}
