@@ -1,57 +1,179 @@
-"""`ssmail plot`: figures of the paper, from the database alone."""
+"""`ssmail plot`: figures of the paper, and training curves, from the database alone."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ssmail.errors import InputError
 from ssmail_cli.display import note
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.figures import FigureRecord
+    from ssmail.store import RunRow, Store
+
+TRAINING = "training"
+DEFAULT_METRIC, DEFAULT_GROUPS = "train/mode_mse", "method"
+
+OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
+Formats = Annotated[
+    list[str] | None,
+    typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
+]
 
 
 def plot(
     figures: Annotated[
         list[str],
-        typer.Argument(metavar="FIGURE...", help="fig4 (stability), fig5 (modes), fig9 (yjunction)."),
+        typer.Argument(
+            metavar="FIGURE...",
+            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), or training.",
+        ),
     ],
-    out: Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")] = Path(
-        "results/figures"
-    ),
-    formats: Annotated[
-        list[str] | None,
-        typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
-    ] = None,
+    out: OutDir = Path("results/figures"),
+    formats: Formats = None,
     runs: Annotated[
         list[str] | None,
         typer.Option(
             "--runs",
             metavar="RUN[,RUN...]",
             help="Draw these runs (ids or their first digits); repeatable.",
-            show_default="the spec with the most seeds",
+            show_default="those of experiments.yaml, else the spec with the most seeds; of training: all",
+        ),
+    ] = None,
+    profile: Annotated[str | None, typer.Option("--profile", help="Only runs of this profile.")] = None,
+    stat: Annotated[
+        str | None,
+        typer.Option(
+            "--stat",
+            help="Centre and band of fig3, fig4, fig6 and training: mean-std, median-iqr or mean-ci.",
+            show_default="mean-std",
+        ),
+    ] = None,
+    metrics: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="training: draw this metric; repeatable.", show_default=DEFAULT_METRIC),
+    ] = None,
+    methods: Annotated[
+        list[str] | None, typer.Option("--method", help="training: only runs of this method; repeatable.")
+    ] = None,
+    environment: Annotated[str | None, typer.Option("--env", help="training: only runs on this environment.")] = None,
+    group_by: Annotated[
+        str | None,
+        typer.Option(
+            "--group-by",
+            help="training: method, seed, or a key of the spec such as curriculum.beta.",
+            show_default=DEFAULT_GROUPS,
         ),
     ] = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
-    """Draw figures of the paper from stored runs.
+    """Draw figures of the paper, or the metrics of any runs over epochs (training).
 
     Each comes with a CSV of exactly what it shows, and the ids of the runs stand in the metadata of the files. Prints
     the paths of the files.
     """
+    from ssmail.figures import FIGURES
+
+    training_options = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
+    given = [option for option, value in training_options.items() if value is not None]
+    ids = [part for text in runs or [] for part in text.split(",") if part] or None
+    _check(figures, formats or [], given)
+    if ids and profile and figures != [TRAINING]:
+        raise InputError("--runs names the runs already; leave --profile out.")
+    statistic = _statistic(stat, figures)
+    store = open_store(db)
+    for name in dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures):
+        if name == TRAINING:
+            chosen = _chosen(store, ids, methods, environment, profile)
+            _draw_training(chosen, store, metrics or [DEFAULT_METRIC], group_by, statistic, out, formats)
+        else:
+            record = FIGURES[name].collect(store, ids, profile=profile, statistic=statistic)
+            _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)
+
+
+def _check(figures: Sequence[str], formats: Sequence[str], training_options: Sequence[str]) -> None:
+    """Refuse unknown names, and options of training beside figures that know nothing of them."""
     from ssmail.experiments import unknown_name
-    from ssmail.figures import FIGURES, save
+    from ssmail.figures import FIGURES
     from ssmail.figures.provenance import FORMATS
 
     for name in figures:
-        if name not in FIGURES:
-            raise unknown_name("figure", name, FIGURES)
-    for form in formats or []:
+        if name not in FIGURES and name != TRAINING:
+            raise unknown_name("figure", name, [*FIGURES, TRAINING])
+    for form in formats:
         if form not in FORMATS:
             raise unknown_name("figure format", form, FORMATS)
-    ids = [part for text in runs or [] for part in text.split(",") if part] or None
-    store = open_store(db)
-    for name in dict.fromkeys(FIGURES[name].name for name in figures):
-        record = FIGURES[name].collect(store, ids)
-        for remark in record.notes:
-            note(f"{name}: {remark}")
-        for path in save(name, record, FIGURES[name].draw(record), out, formats or ["png"]):
-            typer.echo(path)
+    others = [name for name in figures if name != TRAINING]
+    if training_options and others:
+        raise InputError(
+            f"{training_options[0]} belongs to `ssmail plot {TRAINING}`; draw {', '.join(others)} without it."
+        )
+
+
+def _statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.experiments import unknown_name
+    from ssmail.figures import FIGURES
+
+    if stat is None:
+        return None
+    if stat not in list(Statistic):
+        raise unknown_name("statistic", stat, list(Statistic))
+    if not any(name == TRAINING or FIGURES[name].has_statistic for name in figures):
+        raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
+    return Statistic(stat)
+
+
+def _chosen(
+    store: "Store",
+    ids: Sequence[str] | None,
+    methods: Sequence[str] | None,
+    environment: str | None,
+    profile: str | None,
+) -> "list[RunRow]":
+    """The runs that meet every condition, newest last. Raises InputError when there is none, or an unknown name."""
+    from ssmail.experiments import load_experiments, unknown_name
+
+    runs = store.runs(ids=ids, environment=environment, profile=profile)
+    for method in methods or []:
+        known = {run.method for run in store.runs()} | set(load_experiments().methods)
+        if method not in known:
+            raise unknown_name("method", method, sorted(known))
+    runs = [run for run in runs if methods is None or run.method in methods]
+    if not runs:
+        raise InputError(f"no run in {store.where} meets these conditions; `ssmail runs list` shows those there are.")
+    return runs
+
+
+def _draw_training(
+    runs: "list[RunRow]",
+    store: "Store",
+    metrics: Sequence[str],
+    group_by: str | None,
+    statistic: "Statistic | None",
+    out: Path,
+    formats: Sequence[str] | None,
+) -> None:
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.figures import training_curves
+
+    record = training_curves.collect(store, runs, metrics, group_by or DEFAULT_GROUPS, statistic or Statistic.MEAN_STD)
+    _save(TRAINING, record.stem, record, training_curves.draw(record), out, formats)
+
+
+def _save(
+    name: str, stem: str, record: "FigureRecord", figure: "Figure", out: Path, formats: Sequence[str] | None
+) -> None:
+    """Write the files, tell the notes on stderr and the paths on stdout."""
+    from ssmail.figures.saving import save_figure
+
+    for remark in record.notes:
+        note(f"{name}: {remark}")
+    for path in save_figure(stem, record, figure, out, formats or ["png"]):
+        typer.echo(path)

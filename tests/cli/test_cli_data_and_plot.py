@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from ssmail.data import expert_file, yjunction
+from ssmail.evaluation.statistics import Statistic
 from ssmail.experiments import build_spec
 from ssmail.figures import FIGURES, provenance
 from ssmail.store import RunState, Store
@@ -117,3 +118,61 @@ def test_an_unknown_format(cli: CommandLine, db: Path, tmp_path: Path) -> None:
     outcome = cli("plot", "fig4", "--format", "jpg", "--out", tmp_path / "figures", "--db", db)
     assert outcome.code == 2
     assert outcome.sentence == "unknown figure format 'jpg'; did you mean png?"
+
+
+def test_the_help_names_every_figure_and_statistic(cli: CommandLine) -> None:
+    shown = " ".join(cli("plot", "--help").out.split())
+    for module in FIGURES.values():
+        assert f"{module.name} ({module.alias})" in shown
+    assert all(statistic in shown.replace("mean- ", "mean-") for statistic in Statistic)
+    having = [name for name in dict.fromkeys(module.name for module in FIGURES.values()) if FIGURES[name].has_statistic]
+    assert f"of {', '.join(having)} and training" in shown
+
+
+def test_a_statistic_can_be_chosen(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    out = tmp_path / "figures"
+    outcome = cli("plot", "fig4", "fig5", "--stat", "median-iqr", "--out", out, "--db", db)
+    assert outcome.code == 0
+    assert ",median," not in (out / "fig4_stability.csv").read_text()
+    assert "\nmedian," in (out / "fig4_stability.csv").read_text()
+    cli("plot", "fig4", "--out", out, "--db", db)
+    assert "\nmean," in (out / "fig4_stability.csv").read_text()
+
+
+def test_training_curves_of_any_metric(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    out = tmp_path / "figures"
+    options = ("--metric", "train/mode_mse", "--method", "ssail", "--env", "yjunction", "--profile", "smoke")
+    outcome = cli("plot", "training", *options, "--group-by", "seed", "--out", out, "--db", db)
+    names = [Path(line).name for line in outcome.out.splitlines()]
+    assert names == ["training_train-mode_mse.png", "training_train-mode_mse.csv"]
+    (run,) = Store.open(db).runs()
+    assert provenance.read(out / names[0]).run_ids == (run.id,)
+    assert "seed 0" in (out / names[1]).read_text()
+    both = cli("plot", "training", "fig4", "--runs", run.id[:8], "--out", out, "--db", db)
+    assert [Path(line).name for line in both.out.splitlines()][2:] == ["fig4_stability.png", "fig4_stability.csv"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("fig4 --metric train/mode_mse", "--metric belongs to `ssmail plot training`; draw fig4 without it."),
+        ("training fig4 --group-by seed", "--group-by belongs to `ssmail plot training`; draw fig4 without it."),
+        ("fig9 --stat mean-ci", "fig9 shows no centre and band; leave --stat out."),
+        ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
+        ("fig10", "unknown figure 'fig10'; did you mean fig"),
+        ("trainin", "unknown figure 'trainin'; did you mean training?"),
+        ("fig4 --runs ab --profile smoke", "--runs names the runs already; leave --profile out."),
+        ("training --method sail", "unknown method 'sail'; did you mean ssail?"),
+        ("training --method bc", "meets these conditions; `ssmail runs list` shows those there are."),
+        ("training --metric mode_mse", "has a metric 'mode_mse'; the nearest stored are "),
+        (
+            "training --group-by curriculum.bta",
+            "unknown key to group by 'curriculum.bta'; did you mean curriculum.beta?",
+        ),
+        ("fig6 --profile quick", "run `ssmail ablate beta --profile quick --seeds 0-4`."),
+    ],
+)
+def test_what_does_not_go_together_is_said(cli: CommandLine, db: Path, arguments: str, sentence: str) -> None:
+    outcome = cli("plot", *arguments.split(), "--db", db)
+    assert outcome.code == 2
+    assert sentence in outcome.sentence

@@ -1,11 +1,13 @@
 """A small hand-made database, written through the store's own API."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
-from ssmail.experiments import build_spec
+from ssmail.experiments import ablation_specs, build_spec
+from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store
 
 from .handmade_arrays import arrays
@@ -15,7 +17,11 @@ AddRun = Callable[..., str]
 
 @pytest.fixture
 def add_run(store: Store) -> AddRun:
-    """add_run(seed, errors, state, ...) -> run id: one epoch for each error; a finished run has final results too."""
+    """add_run(seed, errors, state, ...) -> run id: one epoch for each error; a finished run has final results too.
+
+    The spec is that of the method in profile smoke with `overrides`, or the given one. `epochs` holds more metrics, a
+    value for each epoch; `final` more final ones, and `extra` arrays in place of the handmade ones.
+    """
 
     def add(
         seed: int = 0,
@@ -24,20 +30,59 @@ def add_run(store: Store) -> AddRun:
         *,
         method: str = "ssail",
         overrides: Sequence[str] = (),
+        spec: RunSpec | None = None,
         dataset_hash: str = "d" * 64,
         shift: float = 0.0,
+        epochs: Mapping[str, Sequence[float]] | None = None,
+        final: Mapping[str, float] | None = None,
         **extra: np.ndarray,
     ) -> str:
-        spec = build_spec("ssail", "yjunction", "smoke", overrides).model_copy(update={"method": method})
+        spec = spec or build_spec(method, "yjunction", "smoke", overrides)
         writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", replace=True)
         for epoch, error in enumerate(errors, start=1):
-            writer.epoch(epoch, {"train/mode_mse": error, "actor/loss": -1.0})
+            more = {name: values[epoch - 1] for name, values in (epochs or {}).items()}
+            writer.epoch(epoch, {"train/mode_mse": error, "actor/loss": -1.0, **more})
         if state is RunState.FINISHED:
             writer.arrays({**arrays(shift), **{name.replace("__", "/"): value for name, value in extra.items()}})
-            final = {"test/on_lane": 0.9, "test/lane_balance": 0.25, "test_constant_velocity/mode_mse": 0.045}
-            writer.final(len(errors), final)
+            results = {"test/on_lane": 0.9, "test/lane_balance": 0.25, "test_constant_velocity/mode_mse": 0.045}
+            writer.final(len(errors), {**results, **(final or {})})
         if state is not RunState.RUNNING:
             writer.finish(state)
         return writer.run_id
+
+    return add
+
+
+@pytest.fixture
+def ablate(add_run: AddRun) -> AddRun:
+    """ablate(name, {value: [results of seeds 0, 1, ...]}) -> {value: run ids}, in profile smoke.
+
+    A result is the error of the last epoch and of the test; None is a run that diverged in its second epoch. Segments
+    are measured 10 % longer than expected, and grow by a step each epoch.
+    """
+
+    def add(
+        name: str, results: Mapping[Any, Sequence[float | None]], overrides: Sequence[str] = (), balance: float = 0.25
+    ) -> dict[Any, list[str]]:
+        specs = ablation_specs(name, "smoke", values=list(results), overrides=overrides)
+        expected = [1.0, 2.0, 3.0]
+        segments = {
+            "curriculum/expected_segment_length": expected,
+            "curriculum/segment_length": [1.1 * length for length in expected],
+        }
+        return {
+            value: [
+                add_run(
+                    seed,
+                    [1.0] if error is None else [1.0, 0.5, error],
+                    RunState.DIVERGED if error is None else RunState.FINISHED,
+                    spec=specs[value],
+                    epochs=segments,
+                    final={"test/lane_balance": balance} | ({} if error is None else {"test/mode_mse": error}),
+                )
+                for seed, error in enumerate(errors)
+            ]
+            for value, errors in results.items()
+        }
 
     return add

@@ -132,8 +132,22 @@ def test_two_groups_stand_in_two_columns(store: Store, add_run: Any) -> None:
     ids = [add_run(0), add_run(1), add_run(0, overrides=["sac.gamma=0.5"])]
     figure = fig5_modes.draw(fig5_modes.collect(store, ids))
     labels = [f"ssail {spec}" for spec in dict.fromkeys(run.spec_hash[:8] for run in store.runs())]
-    places = {tuple(words(axes)[:2]): axes.get_subplotspec().colspan.start for axes in panels(figure)}
-    assert places == {(labels[0], "seed 0"): 0, (labels[0], "seed 1"): 0, (labels[1], "seed 0"): 1}
+    places = {(words(axes)[0], axes.get_subplotspec().colspan.start) for axes in panels(figure)}
+    assert places == {("seed 0", 0), ("seed 1", 0), ("seed 0", 1)}
+    assert [axes.get_title() for axes in panels(figure)] == [labels[0], labels[1], ""]
+
+
+def test_methods_stand_side_by_side_in_the_order_of_experiments_yaml(store: Store, add_run: Any) -> None:
+    for seed in range(2):
+        for method in ("dnri", "ssail"):
+            add_run(seed, method=method, shift=seed)
+    figure = fig5_modes.draw(fig5_modes.collect(store))
+    assert [axes.get_title() for axes in panels(figure)] == ["ssail", "dnri", "", ""]
+    for axes, method in zip(panels(figure), ("ssail", "dnri") * 2, strict=True):
+        assert len(paths(axes, style.METHODS[method].colour)) == STARTS * AGENTS
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in panels(figure))
 
 
 def test_an_unfinished_run_is_refused(store: Store, add_run: Any) -> None:

@@ -64,7 +64,7 @@ def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) ->
     command = "run `ssmail train --method ssail --env yjunction --profile quick --seeds 0-4`."
     with pytest.raises(NoRuns) as empty:
         fig9_yjunction.collect(store)
-    assert str(empty.value) == f"fig9 has nothing to draw: {store.url} holds no run on yjunction; {command}"
+    assert str(empty.value) == f"fig9 has nothing to draw: {store.where} holds no run on yjunction; {command}"
     add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(NoRuns, match="holds no finished run on yjunction"):
         fig9_yjunction.collect(store)

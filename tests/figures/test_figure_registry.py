@@ -12,10 +12,14 @@ from ssmail.figures import FIGURES, style
 
 def test_names_and_aliases_lead_to_the_same_figure() -> None:
     assert {name: module.name for name, module in FIGURES.items()} == {
+        "fig3": "fig3",
+        "curricula": "fig3",
         "fig4": "fig4",
         "stability": "fig4",
         "fig5": "fig5",
         "modes": "fig5",
+        "fig6": "fig6",
+        "beta": "fig6",
         "fig9": "fig9",
         "yjunction": "fig9",
     }
@@ -34,7 +38,9 @@ def test_importing_the_registry_imports_nothing_heavy() -> None:
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("labels", [["ssail"], ["ssail", "gail", "wail"], ["ssail a", "ssail b"], ["ssail", "new"]])
+@pytest.mark.parametrize(
+    "labels", [["ssail"], ["ssail", "gail", "wail"], ["ssail a", "ssail b"], ["ssail", "new"], [*"abcdefghij"]]
+)
 def test_groups_are_told_apart(labels: list[str]) -> None:
     strokes = style.strokes(labels)
     assert list(strokes) == labels

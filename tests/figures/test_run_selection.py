@@ -5,44 +5,76 @@ from typing import Any
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.experiments import FigureRequirements
+from ssmail.experiments import FigureRequirements, build_spec
 from ssmail.figures import NoRuns, selection
 from ssmail.store import RunState, Store
 
 OTHER = ["sac.gamma=0.5"]
+ANOTHER = ["sac.gamma=0.6"]
 
 
 def chosen(store: Store, ids: list[str] | None = None) -> dict[str, list[str]]:
     return {group.label: [run.id for run in group.runs] for group in selection.select(store, "fig4", ids).groups}
 
 
-def test_the_spec_with_most_settled_seeds_is_drawn_alone(store: Store, add_run: Any) -> None:
-    most = [add_run(seed) for seed in (0, 1)]
-    most.append(add_run(2, state=RunState.DIVERGED))
-    for seed in (0, 1):
+def test_the_spec_of_experiments_yaml_is_drawn_even_with_fewer_seeds(store: Store, add_run: Any) -> None:
+    current = [add_run(0)]
+    for seed in range(3):
         add_run(seed, overrides=OTHER)
-    for seed in (2, 3, 4):  # unfinished seeds do not count
-        add_run(seed, overrides=OTHER, state=RunState.INTERRUPTED)
+    assert chosen(store) == {"ssail": current}
+
+
+def test_without_it_the_spec_with_most_settled_seeds_is_drawn_alone(store: Store, add_run: Any) -> None:
+    most = [add_run(seed, overrides=OTHER) for seed in (0, 1)]
+    most.append(add_run(2, overrides=OTHER, state=RunState.DIVERGED))
+    for seed in (0, 1):
+        add_run(seed, overrides=ANOTHER)
+    for seed in (2, 3, 4):  # unfinished seeds do not count, not even of the spec of experiments.yaml
+        add_run(seed, overrides=ANOTHER, state=RunState.INTERRUPTED)
+        add_run(seed, state=RunState.INTERRUPTED)
     assert chosen(store) == {"ssail": most}
 
 
 def test_the_newest_spec_is_drawn_on_a_tie(store: Store, add_run: Any) -> None:
-    old = [add_run(seed) for seed in (0, 1)]
-    new = [add_run(seed, overrides=OTHER) for seed in (1, 0)]
+    old = [add_run(seed, overrides=OTHER) for seed in (0, 1)]
+    new = [add_run(seed, overrides=ANOTHER) for seed in (1, 0)]
     assert chosen(store) == {"ssail": new[::-1]}
-    newest = add_run(0)  # the old spec becomes the newest when one of its seeds is trained again
+    newest = add_run(0, overrides=OTHER)  # the old spec becomes the newest when one of its seeds is trained again
     assert chosen(store) == {"ssail": [newest, old[1]]}
+
+
+def test_all_methods_are_drawn_from_one_profile(store: Store, add_run: Any) -> None:
+    quick = {method: build_spec(method, "yjunction", "quick") for method in ("ssail", "gail")}
+    lone = add_run(0, method="wail")
+    small = [add_run(0, method="gail"), lone]
+    full = [add_run(seed, spec=spec) for spec in quick.values() for seed in (0, 1)]
+    assert chosen(store) == {"ssail": full[:2], "gail": full[2:]}
+    notes = selection.select(store, "fig4").notes
+    assert notes[-1] == (
+        "wail is missing; run `ssmail train --method wail --env yjunction --profile quick --seeds 0-4`."
+    )
+    assert "1 other stored spec left out" in notes[1]
+    asked = selection.select(store, "fig4", profile="smoke")
+    assert [run.id for run in asked.runs] == small
+
+
+def test_runs_of_a_forgotten_profile_or_method_can_be_drawn(store: Store, add_run: Any) -> None:
+    old = build_spec("ssail", "yjunction", "smoke").model_copy(update={"profile": "forgotten"})
+    run = add_run(0, spec=old)
+    assert chosen(store) == {"ssail": [run]}
+    assert "; not the spec that experiments.yaml gives now" in selection.select(store, "fig4").notes[0]
+    assert add_run(0) in chosen(store)["ssail"]  # the newest profile on a tie
 
 
 def test_what_is_left_out_is_said(store: Store, add_run: Any) -> None:
     add_run(0)
     add_run(1, state=RunState.FAILED)
-    (note,) = selection.select(store, "fig4").notes
+    note = selection.select(store, "fig4").notes[0]
     spec_hash = store.runs()[0].spec_hash[:8]
     assert note == f"ssail: spec {spec_hash} (profile smoke), seeds 0; 1 unfinished run left out."
     add_run(0, overrides=OTHER)
-    add_run(0, overrides=["sac.gamma=0.6"])
-    (note,) = selection.select(store, "fig4").notes
+    add_run(0, overrides=ANOTHER)
+    note = selection.select(store, "fig4").notes[0]
     assert "2 other stored specs left out (choose with --runs)" in note
 
 
@@ -74,7 +106,9 @@ def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) ->
     command = "run `ssmail train --method ssail --env yjunction --profile quick --seeds 0-4`."
     with pytest.raises(NoRuns) as empty:
         chosen(store)
-    assert str(empty.value) == (f"fig4 has nothing to draw: {store.url} holds no run of ssail on yjunction; {command}")
+    assert str(empty.value) == (
+        f"fig4 has nothing to draw: {store.where} holds no run of ssail on yjunction; {command}"
+    )
     assert empty.value.exit_code == 2
     add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(NoRuns, match="holds only unfinished runs of ssail") as unfinished:
@@ -84,20 +118,18 @@ def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) ->
     assert len(chosen(store)["ssail"]) == 1
 
 
-def test_a_missing_method_is_said_and_the_others_are_drawn(
-    store: Store, add_run: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    required = FigureRequirements("yjunction", ("ssail", "gail"))
-    monkeypatch.setattr(selection, "figure_requirements", lambda name: required)
+def test_a_missing_method_is_said_and_the_others_are_drawn(store: Store, add_run: Any) -> None:
     ssail = add_run(0)
-    notes = selection.select(store, "fig4").notes
+    notes = selection.select(store, "fig5").notes
     assert notes[-1] == (
-        "gail is missing; run `ssmail train --method gail --env yjunction --profile quick --seeds 0-4`."
+        "dnri is missing; run `ssmail train --method dnri --env yjunction --profile smoke --seeds 0-4`."
     )
-    gail = add_run(0, method="gail")
-    assert chosen(store) == {"ssail": [ssail], "gail": [gail]}
+    dnri = add_run(0, method="dnri")
+    groups = selection.select(store, "fig5").groups
+    assert {group.label: [run.id for run in group.runs] for group in groups} == {"ssail": [ssail], "dnri": [dnri]}
 
 
-def test_a_password_in_the_url_is_not_told(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store, "url", "postgresql://me:secret@host/runs")
-    assert selection.place(store) == "postgresql://me:***@host/runs"
+def test_no_run_of_the_profile_asked_for(store: Store, add_run: Any) -> None:
+    add_run(0)
+    with pytest.raises(NoRuns, match=r"holds no run of ssail on yjunction of profile paper; run .* --profile paper "):
+        selection.select(store, "fig4", profile="paper")

@@ -1,4 +1,4 @@
-"""The figures of the paper, redrawn from the store alone.
+"""The figures of the paper, redrawn from the store alone; and `training_curves`, for questions that it does not ask.
 
 Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
 Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from ssmail.evaluation.statistics import Statistic
     from ssmail.figures.provenance import Provenance
     from ssmail.store import Store
 
@@ -51,18 +52,28 @@ class FigureModule:
     name: str
     alias: str
     summary: str
+    has_statistic: bool = False  # whether it shows a centre and spread, of one's choice
 
     @property
     def stem(self) -> str:
         """The name of the module and, without the ending, of the files that are saved."""
         return f"{self.name}_{self.alias}"
 
-    def collect(self, store: "Store", runs: Sequence[str] | None = None) -> FigureRecord:
-        """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs.
+    def collect(
+        self,
+        store: "Store",
+        runs: Sequence[str] | None = None,
+        *,
+        profile: str | None = None,
+        statistic: "Statistic | None" = None,
+    ) -> FigureRecord:
+        """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs, of `profile`.
 
-        Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
+        `statistic` is for figures that have one, mean-std by default. Raises NoRuns when there is nothing to draw,
+        InputError for an unknown or unfit id.
         """
-        return cast(FigureRecord, self._module().collect(store, runs))
+        options = {"statistic": statistic} if self.has_statistic and statistic is not None else {}
+        return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
 
     def draw(self, record: FigureRecord) -> "Figure":
         """The record as a matplotlib Figure, one column wide."""
@@ -73,8 +84,10 @@ class FigureModule:
 
 
 _MODULES = (
-    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed"),
+    FigureModule("fig3", "curricula", "segment lengths over epochs, under each curriculum", has_statistic=True),
+    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
+    FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", has_statistic=True),
     FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
 )
 

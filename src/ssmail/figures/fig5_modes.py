@@ -80,12 +80,12 @@ class ModesRecord:
         return int((~inside).any(axis=(1, 2)).sum())
 
 
-def collect(store: Store, runs: Sequence[str] | None = None) -> ModesRecord:
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
     """The test rollouts of the runs that `ssmail.figures.selection` chooses, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
     """
-    selection = select(store, NAME, runs)
+    selection = select(store, NAME, runs, profile)
     for run in selection.runs:
         if run.state not in SETTLED:
             raise InputError(f"run {run.name} ({run.state}) has no test rollouts; leave it out or train it to its end.")
@@ -157,7 +157,10 @@ def _panel_rows(panel: Panel) -> pd.DataFrame:
 
 
 def draw(record: ModesRecord) -> Figure:
-    """The record as panels at equal scale: two labels in a column each, any other number in turn over two columns."""
+    """The record as panels at equal scale: two labels in a column each, any other number in turn over two columns.
+
+    A column of its own has the label above it; otherwise panels of several labels say theirs.
+    """
     labels = list(dict.fromkeys(panel.label for panel in record.panels))
     cells = _cells(record.panels, labels)
     rows, columns = (max(place[i] for place in cells) + 1 for i in (0, 1))
@@ -171,7 +174,9 @@ def draw(record: ModesRecord) -> Figure:
                 axes.set_axis_off()
                 continue
             axes.tick_params(labelbottom=(row + 1, column) not in cells)
-            title = f"seed {panel.seed}" if len(labels) == 1 else f"{panel.label}\nseed {panel.seed}"
+            if len(labels) == 2 and row == 0:
+                axes.set_title(panel.label, weight="bold", pad=4)
+            title = f"{panel.label}\nseed {panel.seed}" if len(labels) > 2 else f"seed {panel.seed}"
             _draw_panel(axes, panel, record, title, strokes[panel.label].colour)
         figure.supxlabel("x (step lengths)", fontsize=8)
         figure.supylabel("y (step lengths)", fontsize=8)
@@ -203,7 +208,7 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
     if panel.rollouts is None:
         words = ["diverged:", "no test rollouts"]
     else:
-        _draw_paths(axes, panel.rollouts, color=colour, lw=0.35, alpha=0.7)
+        _draw_paths(axes, panel.rollouts, color=colour, lw=0.4, alpha=0.8)
         ends = panel.rollouts[:, -1].reshape(-1, 2)
         axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
         words = [f"{100 * panel.on_lane:.0f} % on lane", f"rarer lane {100 * panel.lane_balance:.0f} %"]

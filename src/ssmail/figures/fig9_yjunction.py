@@ -19,7 +19,7 @@ from ssmail.errors import InputError
 from ssmail.experiments import figure_requirements
 from ssmail.figures import NoRuns, style
 from ssmail.figures.provenance import Provenance
-from ssmail.figures.selection import command, place
+from ssmail.figures.selection import command
 from ssmail.store import RunRow, Store
 
 NAME = "fig9"
@@ -55,12 +55,12 @@ class YJunctionRecord:
         return pd.DataFrame(rows, columns=["kind", "lane", "agent", "step", "x", "y"])
 
 
-def collect(store: Store, runs: Sequence[str] | None = None) -> YJunctionRecord:
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> YJunctionRecord:
     """The environment as the newest run that holds it stored it; among the given ids, if there are any.
 
     Raises NoRuns when no run of the environment holds its expert set, InputError for an unfit id.
     """
-    run, notes = _source(store, runs)
+    run, notes = _source(store, runs, profile)
     expert, lane, centre_lines = (store.array(run.id, name) for name in ARRAYS)
     used, first = np.unique(lane, return_index=True)
     return YJunctionRecord(
@@ -75,19 +75,20 @@ def collect(store: Store, runs: Sequence[str] | None = None) -> YJunctionRecord:
     )
 
 
-def _source(store: Store, ids: Sequence[str] | None) -> tuple[RunRow, tuple[str, ...]]:
-    environment, methods = figure_requirements(NAME)
-    stored = store.runs(ids=ids) if ids else store.runs(environment=environment)
+def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tuple[RunRow, tuple[str, ...]]:
+    needed = figure_requirements(NAME)
+    environment = needed.environment
+    stored = store.runs(ids=ids) if ids else store.runs(environment=environment, profile=profile)
     fitting = [
         run for run in stored if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))
     ]
     if fitting:
         return fitting[-1], (f"the environment is that of run {fitting[-1].name}.",)
-    remedy = f"run {command(methods[0], environment)}"
+    remedy = f"run {command(needed.methods[0], environment, profile)}"
     if ids:
         raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
     found = "no finished run" if stored else "no run"
-    raise NoRuns(f"{NAME} has nothing to draw: {place(store)} holds {found} on {environment}; {remedy}.")
+    raise NoRuns(f"{NAME} has nothing to draw: {store.where} holds {found} on {environment}; {remedy}.")
 
 
 def _strays(trajectories: Floats, line: Floats) -> float:

@@ -8,14 +8,21 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import matplotlib
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 COLUMN_WIDTH = 3.4  # inches: one column of a two-column page
 RESOLUTION = 300  # dots per inch of a PNG
 
 REFERENCE = "#222222"
 LANE = "#D4D4D4"
+REACH = 3.0
 AGENTS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 # The style sheet. Fonts: embedded as text in a PDF, as paths in an SVG. The salt makes SVG ids repeatable.
@@ -35,6 +42,7 @@ SHEET: dict[Any, Any] = {
     "legend.borderaxespad": 0.2,
     "legend.borderpad": 0.2,
     "legend.fontsize": 7,
+    "legend.title_fontsize": 7,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
     "pdf.fonttype": 42,
@@ -45,6 +53,9 @@ SHEET: dict[Any, Any] = {
 }
 
 
+Floats = npt.NDArray[np.float64]
+
+
 class Stroke(NamedTuple):
     """How the lines of one group of runs are drawn."""
 
@@ -52,6 +63,7 @@ class Stroke(NamedTuple):
     line: str
 
 
+LINES = ("-", "--", "-.")
 METHODS = {
     "ssail": Stroke("#0072B2", "-"),
     "gail": Stroke("#D55E00", "--"),
@@ -63,10 +75,16 @@ METHODS = {
 
 
 def strokes(labels: Sequence[str]) -> dict[str, Stroke]:
-    """A stroke for each label: a method's own, and for other labels those that are left, in order."""
-    spare = [stroke for method, stroke in METHODS.items() if method not in labels] or list(METHODS.values())
+    """A stroke for each label: a method's own, and for other labels those that are left, in order.
+
+    Where they do not suffice, the other labels go from dark to light, in viridis, which colour-blind readers can order.
+    """
+    spare = [stroke for method, stroke in METHODS.items() if method not in labels]
     others = [label for label in labels if label not in METHODS]
-    chosen = {label: spare[i % len(spare)] for i, label in enumerate(others)}
+    if len(others) > len(spare):
+        shades = matplotlib.colormaps["viridis"](np.linspace(0, 0.92, len(others)))
+        spare = [Stroke(to_hex(shade), LINES[i % len(LINES)]) for i, shade in enumerate(shades)]
+    chosen = dict(zip(others, spare, strict=False))
     return {label: METHODS.get(label) or chosen[label] for label in labels}
 
 
@@ -84,3 +102,50 @@ def new_figure(height: float) -> Figure:
     figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def log_axis(axes: Axes, limits: tuple[float, float]) -> None:
+    """A logarithmic y axis of these limits; a fine grid within a few decades, where it is needed and legible."""
+    axes.set_yscale("log")
+    axes.set_ylim(*limits)
+    axes.yaxis.set_major_locator(LogLocator(numticks=8))
+    if limits[1] < 1e3 * limits[0]:
+        axes.grid(which="minor", axis="y", lw=0.2)
+    else:
+        axes.yaxis.set_minor_locator(NullLocator())
+
+
+def log_limits(values: Floats, ceiling: float = np.inf) -> tuple[float, float]:
+    """A logarithmic range of at least a decade for the positive finite ones of `values`, up to `ceiling`."""
+    values = values[np.isfinite(values) & (values > 0)]
+    if not len(values):
+        return 1e-3, 1.0
+    top = float(min(values.max() * 1.5, ceiling))
+    return min(float(values.min()) / 1.5, top / 10), top
+
+
+def cut_low(low: Floats, lowest: Floats) -> Floats:
+    """The lower ends of spreads as a logarithmic scale shows them: at most REACH times below the lowest run.
+
+    It would draw an end at or below 0 infinitely deep. NaN and -inf, an end that there is not, stay.
+    """
+    return np.where(np.isfinite(low), np.maximum(low, lowest / REACH), low)
+
+
+def epoch_axis(axes: Axes) -> None:
+    """An x axis of whole epochs."""
+    axes.set_xlabel("epoch")
+    axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+
+
+def draw_reference(axes: Axes, error: float) -> Line2D:
+    """The dotted line of what driving straight on costs; returned for the legend."""
+    return axes.axhline(
+        error, color=REFERENCE, lw=1.0, ls=":", label="constant velocity (test)", gid="constant-velocity"
+    )
+
+
+def draw_cross(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, colour: str) -> Line2D:
+    """A cross, whole also on the edge, for each run that diverged."""
+    (crosses,) = axes.plot(x, y, "x", color=colour, ms=4.5, mew=1.1, clip_on=False, zorder=5)
+    return crosses
