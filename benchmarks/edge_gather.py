@@ -8,7 +8,7 @@ gradients and times can be compared. Nothing here is imported by ssmail.
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.decoders import MessageDecoder, RecurrentDecoder, TypedEdgeMessages
+from ssmail.models.decoders import ActivatedMessages, MessageDecoder, PairPerceptron, RecurrentDecoder
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron
 from ssmail.models.variational_encoder import DynamicEncoder, EdgeEmbedding, StaticEncoder
 
@@ -41,22 +41,36 @@ def on_nodes(perceptron: NodePerceptron, x: Tensor) -> Tensor:
     return normalised(perceptron.norm, nn.functional.elu(perceptron.second(h)))
 
 
-def on_edges(perceptron: EdgePerceptron, x: Tensor, edges: Tensor | None = None) -> Tensor:
-    """x (B, T, N, D) and edges (B, T, E, D') -> (B, T, E, H)."""
+def on_ends(x: Tensor, sender: nn.Linear, receiver: nn.Linear, *skip: tuple[Tensor, nn.Linear]) -> Tensor:
+    """One full linear layer of [x_sender, x_receiver, the edge's own inputs]: x (B, T, N, D) -> (B, T, E, H)."""
     senders, receivers = edge_ends(x.shape[2])
-    inputs, weights = [x[:, :, senders], x[:, :, receivers]], [perceptron.sender.weight, perceptron.receiver.weight]
-    if perceptron.edge is not None and edges is not None:
-        inputs.append(edges)
-        weights.append(perceptron.edge.weight)
-    first = nn.functional.linear(torch.cat(inputs, dim=-1), torch.cat(weights, dim=1), perceptron.receiver.bias)
-    h = perceptron.activation(perceptron.second(perceptron.activation(first)))
+    inputs = [x[:, :, senders], x[:, :, receivers], *(edges for edges, _ in skip)]
+    weights = [sender.weight, receiver.weight, *(layer.weight for _, layer in skip)]
+    return nn.functional.linear(torch.cat(inputs, dim=-1), torch.cat(weights, dim=1), receiver.bias)
+
+
+def on_edges(perceptron: EdgePerceptron, x: Tensor, *skip: Tensor) -> Tensor:
+    """x (B, T, N, D) and the edges (B, T, E, D') of a skip connection -> (B, T, E, H)."""
+    first = on_ends(x, perceptron.sender, perceptron.receiver, *((edges, perceptron.edge) for edges in skip))
+    h = nn.functional.elu(perceptron.second(nn.functional.elu(first)))
     return normalised(perceptron.norm, h)
 
 
-def embedded(embedding: EdgeEmbedding, x: Tensor) -> Tensor:
-    edges = on_edges(embedding.edges_in, on_nodes(embedding.nodes_in, x))
-    nodes = on_nodes(embedding.nodes, mean_by_receiver(edges, x.shape[2]))
-    return on_edges(embedding.edges_out, nodes, edges)
+def messages_of(perceptron: PairPerceptron, x: Tensor) -> Tensor:
+    first = on_ends(x, perceptron.first.sender, perceptron.first.receiver)
+    return perceptron.activation(perceptron.second(perceptron.activation(first)))
+
+
+class GatherEmbedding(nn.Module):
+    def __init__(self, dense: EdgeEmbedding) -> None:
+        super().__init__()
+        self.dense = dense
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x (B, T, N, F) -> (B, T, E, H), sender by sender."""
+        edges = on_edges(self.dense.edges_in, on_nodes(self.dense.nodes_in, x))
+        nodes = on_nodes(self.dense.nodes, mean_by_receiver(edges, x.shape[2]))
+        return on_edges(self.dense.edges_out, nodes, edges)
 
 
 def as_graph(logits: Tensor, agents: int) -> Tensor:
@@ -73,7 +87,7 @@ class GatherStaticEncoder(nn.Module):
         self.dense = dense
 
     def forward(self, x: Tensor) -> Tensor:
-        mean = embedded(self.dense.embedding, x).mean(dim=1, keepdim=True)
+        mean = GatherEmbedding(self.dense.embedding)(x).mean(dim=1, keepdim=True)
         return as_graph(self.dense.head(mean), x.shape[2])
 
 
@@ -83,7 +97,7 @@ class GatherDynamicEncoder(nn.Module):
         self.dense = dense
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        edges = embedded(self.dense.embedding, x)
+        edges = GatherEmbedding(self.dense.embedding)(x)
         b, t, e, h = edges.shape
         sequences = edges.transpose(1, 2).reshape(b * e, t, h)
         if e == 0:
@@ -96,12 +110,12 @@ class GatherDynamicEncoder(nn.Module):
         return as_graph(prior, x.shape[2]), as_graph(posterior, x.shape[2])
 
 
-def received(messages: TypedEdgeMessages, x: Tensor, graph: Tensor) -> Tensor:
+def received(messages: ActivatedMessages, x: Tensor, graph: Tensor) -> Tensor:
     """x (B, T, N, D), graph (B, T or 1, N, N, K) -> (B, T, N, H)."""
     senders, receivers = edge_ends(x.shape[2])
     total = x.new_zeros(*x.shape[:3], messages.size)
     for kind, perceptron in enumerate(messages.types, start=messages.skipped):
-        sent = on_edges(perceptron, x) * graph[:, :, senders, receivers, kind].unsqueeze(-1)
+        sent = messages_of(perceptron, x) * graph[:, :, senders, receivers, kind].unsqueeze(-1)
         total = total + mean_by_receiver(sent, x.shape[2])
     return total
 

@@ -1,4 +1,6 @@
-"""`make bench`: how long the command line, an epoch of training (one thread) and the store take on this machine."""
+"""`make bench`: how long the command line, an epoch of training (one thread), the store and dnri's message passing take
+on this machine.
+"""
 
 import statistics
 import subprocess
@@ -9,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import torch
+from message_passing import compare
 
 from ssmail.experiments import build_spec
 from ssmail.store import Store
@@ -53,3 +56,4 @@ if __name__ == "__main__":
     torch.set_num_threads(1)
     for name, measure in (("ssmail --help", help_text), ("epoch (quick)", epoch), ("stored epoch", stored_epoch)):
         print(f"{name:<16}{measure():9.4f} s", flush=True)
+    compare()

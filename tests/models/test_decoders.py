@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ssmail.models.decoders import MessageDecoder, RecurrentDecoder, TypedEdgeMessages, make_decoder
+from ssmail.models.decoders import ActivatedMessages, MessageDecoder, RecurrentDecoder, make_decoder
 from tests.models.test_message_passing import one_hot_graph
 from tests.models.test_variational_encoder import spec
 
@@ -101,13 +101,13 @@ def test_typed_messages_against_the_formula() -> None:
     n, k, x = 4, 3, torch.randn(1, 1, 4, 3)
     graph = torch.rand(1, 1, n, n, k)
     for skipped in (0, 1):
-        layer = TypedEdgeMessages(3, spec(first_type_is_none=bool(skipped)), torch.tanh)
+        layer = ActivatedMessages(3, spec(first_type_is_none=bool(skipped)), torch.tanh)
         assert len(layer.types) == k - skipped
         expected = torch.zeros(n, layer.size)
         for kind, f in enumerate(layer.types, start=skipped):
             for j in range(n):
                 for i in set(range(n)) - {j}:
-                    first = torch.tanh(f.sender(x[0, 0, i]) + f.receiver(x[0, 0, j]))
+                    first = torch.tanh(f.first.sender(x[0, 0, i]) + f.first.receiver(x[0, 0, j]))
                     expected[j] += graph[0, 0, i, j, kind] * torch.tanh(f.second(first)) / (n - 1)
         torch.testing.assert_close(layer(x, layer.weights(graph))[0, 0], expected)
 

@@ -8,35 +8,54 @@ Inputs x (B, T, N, F) begin with the state [position, velocity] of 2 * A feature
 first; their diagonal is ignored, and T may be 1: one graph for all steps.
 """
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.edge_perceptron import Activation, EdgePerceptron, graph_edges
+from ssmail.models.message_passing import PairLayer, others
 from ssmail.spec import VariationalSpec
 
 
-class TypedEdgeMessages(nn.Module):
-    """mean over senders i of sum_k z_ijk f_k([x_i, x_j]), with an activation after both layers of f_k. With
-    `first_type_is_none` the first type has no perceptron and carries nothing.
+class PairPerceptron(nn.Module):
+    """act(W_2 act(W_s x_i + W_r x_j)) of every ordered pair: x (..., N, D) -> (..., N, N, H), sender first. The
+    activation may work in place.
     """
 
-    def __init__(self, inputs: int, spec: VariationalSpec, activation: Activation) -> None:
+    def __init__(self, inputs: int, hidden: int, activation: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.first = PairLayer(inputs, hidden)
+        self.second = nn.Linear(hidden, hidden)
+        self.activation = activation
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The diagonal, an agent with itself, is computed too and is for the caller to ignore."""
+        return self.activation(self.second(self.activation(self.first(x))))
+
+
+class ActivatedMessages(nn.Module):
+    """mean over senders i of sum_k z_ijk f_k([x_i, x_j]). Unlike in TypedMessages, f_k ends in an activation, as in
+    NRI, so that its second layer is applied to every pair. With `first_type_is_none` the first type has no f_k and
+    carries nothing.
+    """
+
+    def __init__(self, inputs: int, spec: VariationalSpec, activation: Callable[[Tensor], Tensor]) -> None:
         super().__init__()
         self.skipped = int(spec.first_type_is_none)
         self.size = spec.decoder_hidden
         self.types = nn.ModuleList(
-            EdgePerceptron(inputs, self.size, activation) for _ in range(spec.edge_types - self.skipped)
+            PairPerceptron(inputs, self.size, activation) for _ in range(spec.edge_types - self.skipped)
         )
 
     def weights(self, graph: Tensor) -> Tensor:
-        """(B, T, N, N, K) -> the weight of each edge's message of each type, (B, T, N, N - 1, K or K - 1)."""
-        return graph_edges(graph)[..., self.skipped :] / max(graph.shape[2] - 1, 1)
+        """(..., N, N, K) -> the weights of the messages of each type in the mean, (..., N, N, K or K - 1)."""
+        return graph[..., self.skipped :] * others(graph.shape[-2], graph)
 
     def forward(self, x: Tensor, weights: Tensor) -> Tensor:
-        """x (B, T, N, D) and `weights` of the same steps or of one -> (B, T, N, H)."""
+        """x (..., N, D) and weights (..., N, N, K or K - 1) -> (..., N, H)."""
         received = x.new_zeros(*x.shape[:-1], self.size)
         for kind, function in enumerate(self.types):
-            received = received + (function(x) * weights[..., kind : kind + 1]).sum(dim=-2)
+            received = received + (function(x) * weights[..., kind : kind + 1]).sum(dim=-3)
         return received
 
 
@@ -55,7 +74,7 @@ class MessageDecoder(nn.Module):
     def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.action_size = action_size
-        self.messages = TypedEdgeMessages(inputs, spec, torch.relu)
+        self.messages = ActivatedMessages(inputs, spec, torch.relu_)
         self.head = motion_head(inputs + spec.decoder_hidden, spec.decoder_hidden, action_size)
 
     def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, None]:
@@ -78,7 +97,7 @@ class RecurrentDecoder(nn.Module):
     def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.action_size, self.size = action_size, spec.decoder_hidden
-        self.messages = TypedEdgeMessages(self.size, spec, torch.tanh)
+        self.messages = ActivatedMessages(self.size, spec, torch.tanh_)
         self.inputs = nn.Linear(inputs, 3 * self.size)
         self.received = nn.Linear(self.size, 3 * self.size, bias=False)
         self.head = motion_head(self.size, self.size, action_size)
@@ -93,14 +112,14 @@ class RecurrentDecoder(nn.Module):
         hidden = x.new_zeros(b, n, self.size) if memory is None else memory
         states = []
         for step in range(t):
-            hidden = self._update(hidden, from_inputs[:, step], weights[:, step : step + 1])
+            hidden = self._update(hidden, from_inputs[:, step], weights[:, step])
             states.append(hidden)
         a = self.action_size
         return x[..., a : 2 * a] + self.head(torch.stack(states, dim=1)), hidden
 
     def _update(self, hidden: Tensor, from_inputs: Tensor, weights: Tensor) -> Tensor:
-        """One step of all hidden states (B, N, H)."""
-        received = self.received(self.messages(hidden.unsqueeze(1), weights).squeeze(1))
+        """One step of the hidden states (B, N, H)."""
+        received = self.received(self.messages(hidden, weights))
         gates = torch.sigmoid(from_inputs[..., : 2 * self.size] + received[..., : 2 * self.size])
         reset, update = gates.chunk(2, dim=-1)
         candidate = torch.tanh(from_inputs[..., 2 * self.size :] + reset * received[..., 2 * self.size :])

@@ -2,33 +2,24 @@
 Schwing 2020).
 
 An edge's perceptron reads [x_sender, x_receiver]. Its first layer is linear, so it is applied per node and the two
-halves are added by broadcasting (see message_passing). Only the N * (N - 1) edges between different agents are kept,
+halves are added edge by edge (see message_passing). Only the N * (N - 1) edges between different agents are there,
 receiver by receiver: axis -3 of an edge tensor (..., N, N - 1, H) is the receiver j, axis -2 its senders in order, j
 left out. So a mean over senders is a plain mean, and batch norm sees real edges only.
 """
 
-from collections.abc import Callable
-
+import torch
 from torch import Tensor, nn
 
-from ssmail.models.graph_encoder import off_diagonal, on_diagonal
-
-Activation = Callable[[Tensor], Tensor]
+from ssmail.models.graph_encoder import on_diagonal
 
 
-def receiver_edges(pairs: Tensor) -> Tensor:
-    """(B, T, N receivers, N senders, H) -> (B, T, N, N - 1, H)."""
-    b, t, n, _, h = pairs.shape
-    return off_diagonal(pairs).view(b, t, n, n - 1, h)
-
-
-def graph_edges(graph: Tensor) -> Tensor:
-    """A graph, sender first, (B, T, N, N, K) -> its edges, receiver first, (B, T, N, N - 1, K)."""
-    return receiver_edges(graph.transpose(2, 3))
+def senders(agents: int, device: torch.device) -> Tensor:
+    """(N * (N - 1),) the sender of each edge, receiver by receiver."""
+    return torch.arange(agents, device=device).repeat(agents, 1)[~torch.eye(agents, dtype=torch.bool, device=device)]
 
 
 def edge_graph(edges: Tensor) -> Tensor:
-    """Inverse of `graph_edges`, with zeros on the diagonal."""
+    """(B, T, N, N - 1, K) -> the same on pairs, sender first, (B, T, N, N, K), with zeros on the diagonal."""
     return on_diagonal(edges.flatten(2, 3), edges.shape[2]).transpose(2, 3)
 
 
@@ -40,6 +31,11 @@ class FeatureNorm(nn.BatchNorm1d):
     def forward(self, x: Tensor) -> Tensor:
         """(..., H) -> (..., H). Raises ValueError in training on a single vector, which has no variance."""
         return super().forward(x.flatten(0, -2)).view(x.shape) if x.numel() else x
+
+
+def elu(x: Tensor) -> Tensor:
+    """In place: for the output of a linear layer, which nothing else reads."""
+    return nn.functional.elu(x, inplace=True)
 
 
 def norm_layer(size: int, batch_norm: bool) -> nn.Module:
@@ -58,20 +54,17 @@ class NodePerceptron(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x (..., D) -> (..., H)."""
-        out: Tensor = self.norm(nn.functional.elu(self.second(nn.functional.elu(self.first(x)))))
+        out: Tensor = self.norm(elu(self.second(elu(self.first(x)))))
         return out
 
 
 class EdgePerceptron(nn.Module):
-    """norm(act(W_2 act(W_s x_i + W_r x_j + W_e e_ij))) for the edge from i to j; e_ij is an optional embedding of the
+    """norm(ELU(W_2 ELU(W_s x_i + W_r x_j + W_e e_ij))) for the edge from i to j; e_ij is an optional embedding of the
     edge, the skip connection of the encoder.
     """
 
-    def __init__(
-        self, inputs: int, hidden: int, activation: Activation, *, edge_inputs: int = 0, batch_norm: bool = False
-    ) -> None:
+    def __init__(self, inputs: int, hidden: int, batch_norm: bool, edge_inputs: int = 0) -> None:
         super().__init__()
-        self.activation = activation
         self.sender = nn.Linear(inputs, hidden, bias=False)
         self.receiver = nn.Linear(inputs, hidden)
         self.edge = nn.Linear(edge_inputs, hidden, bias=False) if edge_inputs else None
@@ -80,8 +73,10 @@ class EdgePerceptron(nn.Module):
 
     def forward(self, x: Tensor, edges: Tensor | None = None) -> Tensor:
         """x (B, T, N, D) and, with edge_inputs, edges (B, T, N, N - 1, edge_inputs) -> (B, T, N, N - 1, H)."""
-        h = receiver_edges(self.receiver(x).unsqueeze(-2) + self.sender(x).unsqueeze(-3))
+        n = x.shape[2]
+        sent = self.sender(x).index_select(2, senders(n, x.device)).unflatten(2, (n, n - 1))
+        h = sent + self.receiver(x).unsqueeze(-2)
         if self.edge is not None and edges is not None:
             h = h + self.edge(edges)
-        out: Tensor = self.norm(self.activation(self.second(self.activation(h))))
+        out: Tensor = self.norm(elu(self.second(elu(h))))
         return out

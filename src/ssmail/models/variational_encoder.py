@@ -31,11 +31,10 @@ class EdgeEmbedding(nn.Module):
 
     def __init__(self, inputs: int, hidden: int, batch_norm: bool) -> None:
         super().__init__()
-        elu = nn.functional.elu
         self.nodes_in = NodePerceptron(inputs, hidden, batch_norm)
-        self.edges_in = EdgePerceptron(hidden, hidden, elu, batch_norm=batch_norm)
+        self.edges_in = EdgePerceptron(hidden, hidden, batch_norm)
         self.nodes = NodePerceptron(hidden, hidden, batch_norm)
-        self.edges_out = EdgePerceptron(hidden, hidden, elu, edge_inputs=hidden, batch_norm=batch_norm)
+        self.edges_out = EdgePerceptron(hidden, hidden, batch_norm, edge_inputs=hidden)
 
     def forward(self, x: Tensor) -> Tensor:
         """x (B, T, N, F) -> (B, T, N, N - 1, H), receiver by receiver."""
