@@ -183,11 +183,22 @@ def test_the_first_method_is_compared_with_the_others_by_an_exact_test(store: St
         add_run(seed, [0.5, 0.5 + seed], RunState.DIVERGED if seed == 2 else RunState.FINISHED, method="gail")
     (found,) = (note for note in fig4_stability.collect(store).notes if "permutation" in note)
     assert found.startswith("ssail against gail at the last epoch: medians 0.011 and 1.5, exact two-sided")
-    assert found.endswith("p = 0.1 (it could be 0.1 at least).")
+    assert found.endswith("p = 0.1 (least possible 0.1).")
     unfinished = add_run(3, [0.5], RunState.INTERRUPTED, method="gail")
     everything = fig4_stability.collect(store, [run.id for run in store.runs()])
     assert unfinished in everything.provenance.run_ids
     assert "permutation" not in " ".join(everything.notes)  # its last epoch is unknown
+
+
+def test_many_runs_and_runs_that_all_diverged_do_no_harm(store: Store, add_run: Any) -> None:
+    for seed in range(11):
+        add_run(seed, [0.1])
+        add_run(seed, [], RunState.DIVERGED, method="wail")
+    for seed in range(3):
+        add_run(seed, [], RunState.DIVERGED, method="gail")
+    (found,) = (note for note in fig4_stability.collect(store).notes if "permutation" in note)
+    assert found.startswith("ssail against gail at the last epoch: medians 0.1 and inf")
+    assert len(drawn(store).axes) == 3
 
 
 def test_every_method_has_a_panel_of_one_scale(store: Store, add_run: Any) -> None:

@@ -88,6 +88,11 @@ def test_ids_replace_the_choice_and_keep_specs_apart(store: Store, add_run: Any)
         chosen(store, ["zzz"])
 
 
+def test_ids_are_drawn_in_the_order_of_the_methods(store: Store, add_run: Any) -> None:
+    runs = {method: add_run(0, method=method) for method in ("bc", "wail", "gail", "ssail")}
+    assert list(chosen(store, list(runs.values()))) == ["ssail", "gail", "wail", "bc"]
+
+
 def test_runs_on_different_data_are_not_compared(store: Store, add_run: Any) -> None:
     add_run(0)
     add_run(1, dataset_hash="e" * 64)

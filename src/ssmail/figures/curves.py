@@ -63,8 +63,8 @@ class Band:
     @property
     def last(self) -> Floats:
         """(R,) the value of each run at the last epoch: +inf of a run that diverged, NaN of one that ended before."""
-        final = self.epochs[-1:]
-        return np.array([_over(final, curve, self.upwards)[0] if len(final) else np.nan for curve in self.curves])
+        final = self.epochs[-1:] if len(self.epochs) else np.array([1])
+        return np.array([_over(final, curve, self.upwards)[0] for curve in self.curves])
 
     def edges(self, logarithmic: bool, top: float) -> tuple[Floats, Floats]:
         """(E,) twice, the band as it is drawn: nowhere unless it has a lower end, and no higher than `top` if infinite.

@@ -63,7 +63,7 @@ def select(store: Store, figure: str, ids: Sequence[str] | None = None, profile:
     """
     needed = figure_requirements(figure)
     if ids:
-        chosen = _by_ids(runs_of(store, figure, needed.environment, ids))
+        chosen = _by_ids(runs_of(store, figure, needed.environment, ids), needed.methods)
     else:
         chosen = _by_default(store, figure, needed.environment, needed.methods, profile)
     return on_one_data_set(figure, chosen)
@@ -106,8 +106,10 @@ def newest_of_each_seed(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:
     return tuple(newest[seed] for seed in sorted(newest))
 
 
-def _by_ids(runs: Sequence[RunRow]) -> Selection:
-    specs = by_spec(runs)
+def _by_ids(runs: Sequence[RunRow], order: Sequence[str]) -> Selection:
+    """Every run, the methods in the given order and any others after them."""
+    places = {method: place for place, method in enumerate(order)}
+    specs = sorted(by_spec(runs), key=lambda found: places.get(found[0].method, len(places)))
     methods = [found[0].method for found in specs]
     groups = [
         Group(_label(found[0], alone=methods.count(found[0].method) == 1), tuple(sorted(found, key=lambda r: r.seed)))
