@@ -1,10 +1,11 @@
 """Two-layer perceptrons on agents and on the edges between them, as in NRI and DNRI (Kipf et al. 2018; Graber and
 Schwing 2020).
 
-An edge's perceptron reads [x_sender, x_receiver]. Its first layer is linear, so it is applied per node and the two
-halves are added edge by edge (see message_passing). Only the N * (N - 1) edges between different agents are there,
-receiver by receiver: axis -3 of an edge tensor (..., N, N - 1, H) is the receiver j, axis -2 its senders in order, j
-left out. So a mean over senders is a plain mean, and batch norm sees real edges only.
+An edge's perceptron reads [x_sender, x_receiver]. Its first layer is linear, so it is applied per node (see
+message_passing); the sender's half is repeated for each of its edges and the receiver's half is broadcast. Only the N *
+(N - 1) edges between different agents are there, receiver by receiver: axis -3 of an edge tensor (..., N, N - 1, H) is
+the receiver j, axis -2 its senders in order, j left out. So a mean over senders is a plain mean, and batch norm sees
+real edges only.
 """
 
 import torch
