@@ -1,6 +1,6 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -236,6 +236,31 @@ def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> Non
         print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
         print_table(rows, columns)
         print()
+    if len(found) > len(metrics):
+        _print_overview(found, metrics, columns)
+
+
+def _print_overview(found: "list[Comparison]", metrics: Sequence[str], columns: Mapping[str, str]) -> None:
+    """A row for each spec; `seeds` tells how many of its seeds have the first metric."""
+    rows = []
+    for first in found[:: len(metrics)]:
+        group = [item for item in found if item.spec_hash == first.spec_hash]
+        differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
+        rows.append(
+            {
+                "spec": f"{first.method} {differs or first.spec_hash[:8]}",
+                "seeds": f"{len(first.known)}/{len(first.values)}",
+            }
+            | {item.metric: _mean_and_std(item) for item in group}
+        )
+    print("mean ± standard deviation; seeds: how many have the first metric, of how many")
+    print_table(rows, {"spec": "spec", "seeds": "seeds", **{metric: columns[metric] for metric in metrics}})
+
+
+def _mean_and_std(item: "Comparison") -> str | None:
+    if item.mean is None:
+        return None
+    return f"{item.mean:.3g}" if item.std is None else f"{item.mean:.3g} ± {item.std:.2g}"
 
 
 def _seed_label(item: "Comparison", seed: int) -> str:

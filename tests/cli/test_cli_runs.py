@@ -31,8 +31,10 @@ def store(tmp_path: Path) -> Store:
 def add(store: Store) -> AddRun:
     """add(seed, error, *overrides, state=...) -> id of a run of three epochs."""
 
-    def add_run(seed: int, error: float, *overrides: str, state: RunState = RunState.FINISHED) -> str:
-        spec = build_spec("ssail", "yjunction", "smoke", overrides)
+    def add_run(
+        seed: int, error: float, *overrides: str, state: RunState = RunState.FINISHED, method: str = "ssail"
+    ) -> str:
+        spec = build_spec(method, "yjunction", "smoke", overrides)
         writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
         for epoch in (1, 2, 3):
             writer.epoch(epoch, {"validation/mode_mse": error * epoch, "critic/loss": math.inf if epoch == 2 else 0.5})
@@ -179,6 +181,28 @@ def test_the_comparison_table_shows_seeds_and_states(
     assert "1 diverged" in table
     (median,) = {line.split()[1] for line in table.splitlines() if line.startswith("median")} - {"0.1"}
     assert median == "0.006"
+
+
+def test_several_specs_get_an_overview_that_counts_their_seeds(
+    runs: CommandLine, filled: dict[str, str], add: AddRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add(0, 0.03, method="dnri")
+    monkeypatch.setenv("COLUMNS", "200")
+    table = runs("compare", "--format", "table", "--metric", "test/mode_mse").out
+    overview = table[table.index("mean ± standard deviation") :]
+    assert [line.split() for line in overview.splitlines()[-3:]] == [
+        ["ssail", "gamma", "0.95", "3/3", "0.007", "±", "0.0036"],
+        ["ssail", "gamma", "0.5", "1/2", "0.1"],
+        ["dnri", build_spec("dnri", "yjunction", "smoke").hash()[:8], "1/1", "0.03"],
+    ]
+    assert "mean ±" not in runs("compare", "--format", "table", filled["plain 0"]).out
+
+
+def test_specs_are_told_apart_within_their_method(runs: CommandLine, filled: dict[str, str], add: AddRun) -> None:
+    """What one method has and another has not is no difference worth a column."""
+    add(0, 0.03, method="dnri")
+    found = json.loads(runs("compare", "--json", "--metric", "test/mode_mse").out)
+    assert [list(item["differs"]) for item in found] == [["sac.gamma"], ["sac.gamma"], []]
 
 
 def test_export_writes_every_value(runs: CommandLine, filled: dict[str, str], tmp_path: Path) -> None:

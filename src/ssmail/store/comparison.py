@@ -56,12 +56,19 @@ class Comparison:
 
 
 def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> list[Comparison]:
-    """One Comparison for each spec and metric, specs in the order of their first run; `runs` come newest last."""
+    """One Comparison for each spec and metric, specs in the order of their first run; `runs` come newest last. Specs of
+    the same method and environment are told apart by what differs among them.
+    """
     newest = {(run.spec_hash, run.seed): run for run in runs}
     specs: dict[str, list[RunRow]] = {}
     for run in newest.values():
         specs.setdefault(run.spec_hash, []).append(run)
-    differences = _differences({spec: found[0].spec for spec, found in specs.items()})
+    differences: dict[str, dict[str, Any]] = {}
+    for kind in dict.fromkeys((found[0].method, found[0].environment) for found in specs.values()):
+        alike = {
+            spec: found[0].spec for spec, found in specs.items() if (found[0].method, found[0].environment) == kind
+        }
+        differences |= _differences(alike)
     latest = latest_values(store, list(newest.values()), metrics)
     return [
         _comparison(sorted(found, key=lambda run: run.seed), differences[spec], metric, latest)
