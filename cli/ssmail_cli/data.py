@@ -39,7 +39,7 @@ def generate_yjunction(
     """
     from ssmail.data import expert_file, yjunction
     from ssmail.experiments import build_spec
-    from ssmail.spec import METHODS
+    from ssmail.spec import METHODS, used
 
     given = {
         "train": train,
@@ -53,7 +53,7 @@ def generate_yjunction(
     }
     overrides = [f"data.yjunction.{key}={value}" for key, value in given.items() if value is not None]
     spec = build_spec(METHODS[0], "yjunction", "quick", overrides, source="the options")
-    experts = yjunction.generate(spec.data.yjunction)
+    experts = yjunction.generate(used(spec.data.yjunction))
     expert_file.save(experts, out, force=force)
     if as_json:
         write_json({"path": out, "hash": experts.hash, "parameters": experts.parameters}, None)

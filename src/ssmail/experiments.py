@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from ssmail import strict_yaml
 from ssmail.errors import InputError
-from ssmail.spec import OPTIONAL_SECTIONS, SECTIONS, RunSpec
+from ssmail.spec import ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
 from ssmail.spec_keys import check_keys, check_section, nearest, sentence
 
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
@@ -77,7 +77,8 @@ def build_spec(
     """
     experiments = load_experiments(file)
     layers = _file_layers(experiments, method, environment, profile)
-    return _assemble(experiments, [*layers, *_override_layers(overrides, method, source)], method, environment, profile)
+    layers += _override_layers(overrides, method, environment, source)
+    return _assemble(experiments, layers, method, environment, profile)
 
 
 def ablation(name: str, file: Path | None = None) -> Ablation:
@@ -184,7 +185,10 @@ def _assemble(
         check_keys(given, layer.source)
         origins.update(dict.fromkeys(given, layer.source))
         merged = _merge(merged, layer.values)
-    merged |= {name: None for name in OPTIONAL_SECTIONS if name not in SECTIONS.get(method, ())}
+    if method in METHODS and environment in ENVIRONMENTS:
+        merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(sections_of(method, environment)))
+        if environment != "yjunction":
+            merged["data"] = {**merged.get("data", {}), "yjunction": None}
     try:
         return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
@@ -228,7 +232,7 @@ def _ablation(experiments: Experiments, name: str) -> Ablation:
     for key in Ablation._fields[1:]:
         if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
             raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
-    check_section(entry["key"].partition(".")[0], entry["method"], source)
+    check_section(entry["key"], entry["method"], entry["environment"], source)
     return Ablation(name, entry["method"], entry["environment"], entry["key"], tuple(entry["values"]))
 
 
@@ -238,7 +242,7 @@ def _ablation_specs(
     found = _ablation(experiments, name)
     layers = _file_layers(experiments, found.method, found.environment, profile)
     layers += _ablation_layers(experiments, name, profile)
-    given = _override_layers(overrides, found.method, "--set")
+    given = _override_layers(overrides, found.method, found.environment, "--set")
     if any(found.key in dict(leaves(layer.values)) for layer in given):
         raise InputError(f"{found.key} is what the ablation {name} varies; give its values with --values, not --set.")
     source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
@@ -261,11 +265,12 @@ def _ablation_layers(experiments: Experiments, name: str, profile: str) -> list[
     ]
 
 
-def _override_layers(overrides: Sequence[str], method: str, source: str) -> list[_Layer]:
+def _override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[_Layer]:
     """A layer for each override."""
     layers = [_Layer(source, _parse_override(text)) for text in overrides]
     for layer in layers:
-        check_section(next(iter(layer.values)), method, source)
+        for key, _ in leaves(layer.values):
+            check_section(key, method, environment, source)
     return layers
 
 

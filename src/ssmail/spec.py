@@ -21,7 +21,8 @@ Pairing = Literal["start", "nearest", "assignment"]
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
 METHODS: tuple[str, ...] = get_args(Method)
-ENVIRONMENTS = ("yjunction",)
+Environment = Literal["yjunction", "mocap"]
+ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 
 _GAME = ("model", "adversarial", "sac", "curriculum", "training")
 _VARIATIONAL = ("variational", "cloning", "curriculum", "training")
@@ -35,6 +36,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "constant-velocity": (),
     "copy-last": (),
 }  # the sections that a method has beside data and evaluation; the others are null in its spec
+ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "mocap": ("forecast",)}  # likewise
 
 
 class Frozen(BaseModel):
@@ -68,10 +70,10 @@ class YJunctionSpec(Frozen):
 
 
 class DataSpec(Frozen):
-    """Where the expert trajectories come from: a file, or (path null) the generator with these parameters."""
+    """Where the expert trajectories come from: a file, or (path null) the environment's generator."""
 
     path: str | None
-    yjunction: YJunctionSpec
+    yjunction: YJunctionSpec | None  # null in other environments
 
 
 class ModelSpec(Frozen):
@@ -88,6 +90,8 @@ class ModelSpec(Frozen):
     graph_resample: Literal["trajectory", "step"]  # how often that draw is renewed
     time_input: bool  # every network reads the step index, scaled to [-1, 1]
     start_input: bool  # every network reads each agent's first state
+    root_relative: bool  # positions are read relative to the first agent's, whose own are left out
+    agent_input: bool  # every network reads which agent it looks at, one-hot (agents that are not alike, as joints)
     action_step: Positive  # an action moves a velocity by at most this much, scaled units
     action_bound: Positive  # and never beyond this absolute value
     log_std_min: Finite
@@ -110,6 +114,7 @@ class AdversarialSpec(Frozen):
     # std of the Gaussian noise on the states and actions that the discriminator is trained on, scaled units
     input_noise: NonNegative
     reward_scale: Positive
+    reward_limit: Positive | None  # rewards are kept within plus and minus this, after scaling; null: as they are
 
 
 class SelfSupervisionSpec(Frozen):
@@ -209,11 +214,23 @@ class EvaluationSpec(Frozen):
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
 
 
+class ForecastSpec(Frozen):
+    """The test of an environment with recorded motion: how much is observed, how much predicted, and the noise of
+    section 4.6 on what the model reads.
+    """
+
+    observed: Count  # frames given at test time; the last of them is where prediction starts
+    predicted: Count  # frames predicted after them
+    noise: NonNegative  # std in scaled units of the Gaussian noise of the noisy test
+    noise_on: Literal["all", "history"]  # every state that the model reads, or the observed ones alone
+    noise_seed: NonNegativeCount  # of the draws, which all methods and seeds share
+
+
 class RunSpec(Frozen):
     """Everything that defines a run but its seed. A section that the method does not use is null (see SECTIONS)."""
 
     method: Method
-    environment: Literal["yjunction"]
+    environment: Environment
     profile: str
     data: DataSpec
     model: ModelSpec | None
@@ -226,13 +243,19 @@ class RunSpec(Frozen):
     curriculum: CurriculumSpec | None
     training: TrainingSpec | None
     evaluation: EvaluationSpec
+    forecast: ForecastSpec | None
 
     @model_validator(mode="after")
     def _has_its_sections(self) -> Self:
         for name in OPTIONAL_SECTIONS:
-            used, given = name in SECTIONS[self.method], getattr(self, name) is not None
-            if used != given:
-                raise ValueError(f"method {self.method} {'needs' if used else 'has no'} section {name}")
+            needed, given = name in sections_of(self.method, self.environment), getattr(self, name) is not None
+            if needed != given:
+                what = f"{self.method} on {self.environment}"
+                raise ValueError(f"{what} {'needs' if needed else 'has no'} section {name}")
+        if self.environment == "yjunction" and self.data.yjunction is None:
+            raise ValueError("environment yjunction needs data.yjunction")
+        if self.environment != "yjunction" and self.data.path is None:
+            raise ValueError(f"environment {self.environment} needs a data file; set data.path")
         return self
 
     @property
@@ -242,11 +265,13 @@ class RunSpec(Frozen):
 
     def as_json(self) -> str:
         """Canonical JSON: sorted keys, no spaces; equal specs give equal text."""
-        return json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return _canonical(self.model_dump(mode="json"))
 
     def hash(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of `as_json`; names a cell together with the seed."""
-        return hashlib.sha256(self.as_json().encode()).hexdigest()[:16]
+        """First 16 hexadecimal digits of the SHA-256 of the canonical JSON without nulls; names a cell together with
+        the seed. A section that is added for other methods thus leaves the hash as it was.
+        """
+        return hashlib.sha256(_canonical(self.model_dump(mode="json", exclude_none=True)).encode()).hexdigest()[:16]
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:
@@ -254,4 +279,17 @@ class RunSpec(Frozen):
         return cls.model_validate(values)
 
 
-OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for sections in SECTIONS.values() for name in sections))
+def sections_of(method: str, environment: str) -> tuple[str, ...]:
+    """The sections of a spec that are not null, beside data and evaluation."""
+    return (*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
+
+
+def _canonical(values: Any) -> str:
+    return json.dumps(values, sort_keys=True, separators=(",", ":"))
+
+
+OPTIONAL_SECTIONS = tuple(
+    dict.fromkeys(
+        name for table in (SECTIONS, ENVIRONMENT_SECTIONS) for sections in table.values() for name in sections
+    )
+)

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from ssmail import strict_yaml
 from ssmail.errors import InputError
-from ssmail.spec import OPTIONAL_SECTIONS, SECTIONS, RunSpec
+from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
 
 _ARGUMENTS = ("method", "environment", "profile")  # they come from build_spec's arguments, never from a mapping
 
@@ -45,11 +45,18 @@ def check_keys(given: Mapping[str, Any], source: str) -> None:
             raise InputError(f"{given_as} is a section, not a value; set one of its keys such as {first}.")
 
 
-def check_section(section: str, method: str, source: str) -> None:
-    """Raise InputError for a value in a section that the method does not have."""
-    if section in OPTIONAL_SECTIONS and section not in SECTIONS.get(method, OPTIONAL_SECTIONS):
-        users = ", ".join(name for name, sections in SECTIONS.items() if section in sections)
-        raise InputError(f"method {method} has no section '{section}' to set in {source}; it belongs to {users}.")
+def check_section(key: str, method: str, environment: str, source: str) -> None:
+    """Raise InputError for a dotted key in a section that a known method or environment does not have."""
+    if method not in METHODS or environment not in ENVIRONMENTS:
+        return
+    section = key.partition(".")[0]
+    if key.startswith("data.yjunction") and environment != "yjunction":
+        raise InputError(f"environment {environment} has no section 'data.yjunction' to set in {source}.")
+    if section in OPTIONAL_SECTIONS and section not in sections_of(method, environment):
+        tables = {**SECTIONS, **ENVIRONMENT_SECTIONS}
+        users = ", ".join(name for name, sections in tables.items() if section in sections)
+        what = f"method {method} on {environment}"
+        raise InputError(f"{what} has no section '{section}' to set in {source}; it belongs to {users}.")
 
 
 def _section(annotation: Any) -> type[BaseModel] | None:

@@ -51,3 +51,29 @@ def one_step_mse(predicted: Floats, truth: Floats) -> float:
     velocities.
     """
     return float(np.square(predicted - truth).mean())
+
+
+STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
+
+
+def forecast_metrics(
+    predicted: Floats, truth: Floats, scaling: Scaling
+) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    """The metrics of predicted motion, and its error per predicted step.
+
+    predicted (S, B, T, N, 2P) and truth (B, T, N, 2P) are scaled states. mse is the mean squared error over all six
+    features (DNRI's protocol), over samples, windows, steps and agents; mse_h that of step h = 1 .. T; ade and fde the
+    mean and final distance in raw units; diverged the share of predictions with a non-finite or |scaled| > 10 position.
+    Arrays: mse (T,), and mse_spread (T,), the standard deviation (n - 1) over windows of their mean over samples.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.square(predicted - truth).mean(axis=(-2, -1))  # (S, B, T)
+    curve, windows = errors.mean(axis=(0, 1)), errors.mean(axis=0)
+    axes = truth.shape[-1] // 2
+    raw = scaling.unscale_positions(predicted[..., :axes]), scaling.unscale_positions(truth[..., :axes])
+    ade, fde = metrics.displacement_errors(*raw)
+    values = {"mse": float(curve.mean()), "ade": float(ade.mean()), "fde": float(fde.mean())}
+    values |= {f"mse_{h}": float(curve[h - 1]) for h in STEPS if h <= len(curve)}
+    values["diverged"] = metrics.diverged(predicted[..., :axes].reshape(-1, *predicted.shape[2:-1], axes))
+    spread = windows.std(axis=0, ddof=1) if len(windows) > 1 else np.full(len(curve), np.nan)
+    return values, {"mse": curve.astype(np.float64), "mse_spread": spread.astype(np.float64)}

@@ -61,7 +61,7 @@ class AdversarialLearner:
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
         self.experts, self.generators, self.device = setting.experts, setting.generators, setting.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
-        self.features = Features(model.time_input, model.start_input, setting.steps + 1)
+        self.features = Features.of(model, setting.steps + 1, setting.experts.states.shape[2])
         inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
@@ -112,7 +112,7 @@ class AdversarialLearner:
             self.actor_critic.policy,
             self.features,
             self.setting.integrator,
-            expert[:, 0],
+            expert[:, :1],
             steps,
             self.generators["policy"],
             expert=expert,
@@ -173,7 +173,9 @@ class AdversarialLearner:
         return Batch.concatenate([mixed, generated[torch.arange(count, len(generated))]])
 
     def _reward(self, x: Tensor, actions: Tensor) -> Tensor:
-        return self.adversarial.reward_scale * self.game.reward(self.discriminator(x, actions))
+        reward = self.adversarial.reward_scale * self.game.reward(self.discriminator(x, actions))
+        limit = self.adversarial.reward_limit
+        return reward if limit is None else reward.clamp(-limit, limit)
 
     def _pick(self, source: Batch, count: int) -> Batch:
         return source[torch.randint(len(source), (count,), generator=self.generators["data"]).to(self.device)]

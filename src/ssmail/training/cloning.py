@@ -23,7 +23,7 @@ class CloningLearner:
         self.setting, self.cloning, self.training = setting, used(spec.cloning), used(spec.training)
         self.generators, self.device = setting.generators, setting.device
         state_size, action_size = setting.experts.states.shape[-1], setting.experts.actions.shape[-1]
-        features = Features(model.time_input, model.start_input, setting.steps + 1)
+        features = Features.of(model, setting.steps + 1, setting.experts.states.shape[2])
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
             self.policy = GraphPolicy(features.size(state_size), action_size, model).to(self.device)

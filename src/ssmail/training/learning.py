@@ -36,8 +36,18 @@ class Setting:
 class Predictor(Protocol):
     """Predicts trajectories in scaled units, from the weights that it has now."""
 
-    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
-        """States (B, steps + 1, N, D) from `start` (B, N, D), each predicted from the prediction before."""
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """States (B, steps + 1, N, D): the last of those `observed` (B, H, N, D), then each predicted from the
+        predictions before. `noise` (B, H + steps - 1, N, D) is added to every state that is read.
+        """
         ...
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:

@@ -20,10 +20,25 @@ class PolicyPredictor:
     features: Features
     integrator: Integrator
 
-    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
         """See Predictor. Actions are sampled, or their means; the graph is sampled in both cases."""
         made = rollout(
-            self.policy, self.features, self.integrator, start, steps, generator, deterministic=deterministic
+            self.policy,
+            self.features,
+            self.integrator,
+            observed,
+            steps,
+            generator,
+            deterministic=deterministic,
+            noise=noise,
         )
         return made.states
 

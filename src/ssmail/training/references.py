@@ -11,23 +11,32 @@ from ssmail.envs.integrator import Integrator
 
 @dataclass(frozen=True)
 class ConstantVelocity:
-    """Every agent keeps the velocity of the state it is predicted from."""
+    """Every agent takes the velocity that is read of the state it is predicted from."""
 
     integrator: Integrator
 
-    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
         """See Predictor."""
-        states = [start]
-        for _ in range(steps):
-            states.append(self._next(states[-1]))
+        states, first = [observed[:, -1]], observed.shape[1] - 1
+        for t in range(steps):
+            read = states[-1] if noise is None else states[-1] + noise[:, first + t]
+            states.append(self._next(states[-1], read))
         return torch.stack(states, dim=1)
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """See Predictor."""
-        return self._next(states[:, :-1])
+        return self._next(states[:, :-1], states[:, :-1])
 
-    def _next(self, state: Tensor) -> Tensor:
-        return self.integrator.step(state, state[..., state.shape[-1] // 2 :])
+    def _next(self, state: Tensor, read: Tensor) -> Tensor:
+        return self.integrator.step(state, read[..., read.shape[-1] // 2 :])
 
     def state_dict(self) -> dict[str, Any]:
         """Nothing."""
@@ -39,11 +48,21 @@ class ConstantVelocity:
 
 @dataclass(frozen=True)
 class CopyLast:
-    """Every state, velocities included, is the one before."""
+    """Every state, velocities included, is the last observed one as it was read."""
 
-    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
         """See Predictor."""
-        return start.unsqueeze(1).repeat(1, steps + 1, 1, 1)
+        last, first = observed[:, -1:], observed.shape[1] - 1
+        copies = last.repeat(1, steps, 1, 1)
+        return torch.cat([last, copies if noise is None else copies + noise[:, first : first + 1]], dim=1)
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """See Predictor."""

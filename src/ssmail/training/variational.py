@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
-from ssmail.models.graph_encoder import GraphNoise, sample_graph
+from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from ssmail.spec import VariationalSpec, used
 from ssmail.training.actor_critic import clipped_step
@@ -63,6 +63,24 @@ class VariationalModel(nn.Module):
         return self.graph_noise.draw(batch, steps, agents, self.spec.edge_types, generator)
 
 
+class _Graphs:
+    """The sampled graphs of a prediction, step after step: nri's one, or dnri's from the prior and its memory."""
+
+    def __init__(self, model: VariationalModel, observed: Tensor, gumbel: Tensor) -> None:
+        self.model, self.gumbel, self.step = model, gumbel, 0
+        self.memory: Memory | None = None
+        self.fixed = None if model.dynamic else model.sample(model.past_logits(observed)[:, -1:], gumbel)
+
+    def of(self, states: Tensor) -> Tensor:
+        """The graphs (B, T or 1, N, N, K) under which the next steps (B, T, N, D) are decoded."""
+        if self.fixed is not None:
+            return self.fixed
+        assert isinstance(self.model.encoder, DynamicEncoder)
+        logits, self.memory = self.model.encoder.prior(states, self.memory)
+        first, self.step = self.step, self.step + states.shape[1]
+        return self.model.sample(logits, self.gumbel[:, first : self.step])
+
+
 @dataclass(frozen=True)
 class VariationalPredictor:
     """Sampled graphs, and the decoder's mean under each. `deterministic` takes the most likely graph instead."""
@@ -71,20 +89,33 @@ class VariationalPredictor:
     integrator: Integrator
 
     @torch.no_grad()
-    def free_run(self, start: Tensor, steps: int, generator: torch.Generator, *, deterministic: bool = False) -> Tensor:
-        """See Predictor. dnri's graphs are drawn from its prior; nri's one graph from its posterior given the start."""
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """See Predictor. dnri's graphs are drawn from its prior; nri's one graph from its posterior given what was
+        observed. A recurrent decoder has read the observed states too.
+        """
         was_training = self.model.training
         self.model.eval()
-        b, n, _ = start.shape
-        noise = self.model.draw_noise(b, steps, n, generator).to(start.device) * (not deterministic)
-        state, edge_memory, memory = start.unsqueeze(1), None, None
-        graph = None if self.model.dynamic else self.model.sample(self.model.past_logits(state), noise)
+        b, h, n, _ = observed.shape
+        noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
+        gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (not deterministic)
+        graphs = _Graphs(self.model, observed + noise[:, :h], gumbel)
+        memory: Tensor | None = None
+        if h > 1:
+            past = observed[:, :-1] + noise[:, : h - 1]
+            _, memory = self.model.decoder(past, graphs.of(past))
+        state = observed[:, -1:]
         states = [state]
-        for t in range(steps):
-            if isinstance(self.model.encoder, DynamicEncoder):
-                logits, edge_memory = self.model.encoder.prior(state, edge_memory)
-                graph = self.model.sample(logits, noise[:, t : t + 1])
-            action, memory = self.model.decoder(state, graph, memory)
+        for t in range(h - 1, h - 1 + steps):
+            read = state + noise[:, t : t + 1]
+            action, memory = self.model.decoder(read, graphs.of(read), memory)
             state = self.integrator.step(state, action)
             states.append(state)
         self.model.train(was_training)
