@@ -6,6 +6,8 @@ a pair tensor is the sender i, axis -2 the receiver j. Sums over senders are div
 weights suits any number of agents.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
@@ -27,6 +29,50 @@ def mean_over_senders(pairs: Tensor) -> Tensor:
     """(..., N, N, H) -> (..., N, H): the mean over i != j; zeros for a single agent."""
     mean: Tensor = (pairs * others(pairs.shape[-2], pairs)).sum(dim=-3)
     return mean
+
+
+class SumOverSenders(torch.autograd.Function):
+    """sum_i w_ijk relu(s_ik + r_jk), without the tensor of all pairs: sender by sender, forwards and backwards.
+
+    s and r (..., N, K, H), w (..., N, N, K) -> (..., N, K, H). What is computed for a sender stays in the processor's
+    cache, and nothing of it is kept for the gradient. Differentiable twice.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, s: Tensor, r: Tensor, w: Tensor) -> Tensor:
+        """See the class."""
+        ctx.save_for_backward(s, r, w)
+        total = torch.zeros_like(r)
+        for i in range(s.shape[-3]):
+            total.addcmul_(torch.relu_(s[..., i : i + 1, :, :] + r), w[..., i, :, :].unsqueeze(-1))
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """The gradients of s, r and (where it is wanted) w."""
+        s, r, w = ctx.saved_tensors
+        of_s, of_r, of_w = [], torch.zeros_like(r), []
+        for i in range(s.shape[-3]):
+            pairs = torch.relu_(s[..., i : i + 1, :, :] + r)
+            if ctx.needs_input_grad[2]:
+                of_w.append((pairs * gradient).sum(dim=-1))
+            weighted = gradient * w[..., i, :, :].unsqueeze(-1)
+            through = torch.ops.aten.threshold_backward(weighted, pairs, 0)
+            of_r += through
+            of_s.append(through.sum(dim=-3))
+        return torch.stack(of_s, dim=-3), of_r, torch.stack(of_w, dim=-3) if of_w else None
+
+
+DENSE_UP_TO = 8  # agents: up to so many, all pairs at once are faster than sender by sender
+
+
+def sum_over_senders(s: Tensor, r: Tensor, w: Tensor) -> Tensor:
+    """sum_i w_ijk relu(s_ik + r_jk), in the form that is faster for this number of agents; see SumOverSenders."""
+    if s.shape[-3] > DENSE_UP_TO:
+        total: Tensor = SumOverSenders.apply(s, r, w)  # type: ignore[no-untyped-call]  # torch's
+        return total
+    pairs = torch.relu_(s.unsqueeze(-3) + r.unsqueeze(-4))
+    return (pairs * w.unsqueeze(-1)).sum(dim=-4)
 
 
 class PairLayer(nn.Module):
@@ -60,7 +106,8 @@ class EdgeFunction(nn.Module):
         """Their mean over senders: x (..., N, D) -> (..., N, H). The second layer is linear, so it is applied after
         the mean.
         """
-        out: Tensor = self.second(mean_over_senders(torch.relu(self.first(x))))
+        s, r = self.first.sender(x).unsqueeze(-2), self.first.receiver(x).unsqueeze(-2)
+        out: Tensor = self.second(sum_over_senders(s, r, others(x.shape[-2], x)).squeeze(-2))
         return out
 
 
@@ -85,8 +132,7 @@ class TypedMessages(nn.Module):
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
         """x (..., N, D) and graph (..., N, N, K) -> (..., N, H)."""
         weights = graph[..., self.skipped :] * others(x.shape[-2], x)
-        embedded = torch.relu(self.first(x))
-        embedded = embedded.view(*embedded.shape[:-1], self.types, -1)
-        received = (embedded * weights.unsqueeze(-1)).sum(dim=-4).flatten(-2)
+        s, r = (layer(x).unflatten(-1, (self.types, -1)) for layer in (self.first.sender, self.first.receiver))
+        received = sum_over_senders(s, r, weights).flatten(-2)
         messages: Tensor = self.second(received) + self.type_bias(weights.sum(dim=-3))
         return messages
