@@ -242,17 +242,13 @@ def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> Non
 
 def _print_overview(found: "list[Comparison]", metrics: Sequence[str], columns: Mapping[str, str]) -> None:
     """A row for each spec; `seeds` tells how many of its seeds have the first metric."""
-    rows = []
+    rows: list[dict[str, Any]] = []
     for first in found[:: len(metrics)]:
         group = [item for item in found if item.spec_hash == first.spec_hash]
         differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
-        rows.append(
-            {
-                "spec": f"{first.method} {differs or first.spec_hash[:8]}",
-                "seeds": f"{len(first.known)}/{len(first.values)}",
-            }
-            | {item.metric: _mean_and_std(item) for item in group}
-        )
+        spec = f"{first.method} {differs or first.spec_hash[:8]}"
+        seeds = f"{len(first.known)}/{len(first.values)}"
+        rows.append({"spec": spec, "seeds": seeds, **{item.metric: _mean_and_std(item) for item in group}})
     print("mean ± standard deviation; seeds: how many have the first metric, of how many")
     print_table(rows, {"spec": "spec", "seeds": "seeds", **{metric: columns[metric] for metric in metrics}})
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from ssmail.data.yjunction import generate
 from ssmail.evaluation import metrics
-from ssmail.evaluation.protocol import constant_velocity, full_metrics, quick_metrics
+from ssmail.evaluation.protocol import full_metrics, one_step_mse, quick_metrics
 from ssmail.spec import YJunctionSpec
 
 PARAMS = YJunctionSpec(train=30, validation=1, test=20, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
@@ -43,7 +43,8 @@ def test_averaging_the_lanes_is_off_lane() -> None:
 
 
 def test_constant_velocity_is_what_the_bars_are_set_against() -> None:
-    values = quick(constant_velocity(TRUTH))
+    steps = np.arange(PARAMS.steps)[None, :, None, None]
+    values = quick(TRUTH.positions[:, :1] + TRUTH.velocities[:, :1] * steps)
     assert 0.04 < values["mode_mse"] < 0.055
     assert values["on_lane"] == 0
 
@@ -85,3 +86,10 @@ def test_best_of_samples() -> None:
     assert values["ade"] > 1
     one_lane = full_metrics(TRUTH.continuations[:1], TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
     assert one_lane["min_ade_20"] > 1
+
+
+def test_one_step_error_is_the_mean_over_everything() -> None:
+    truth = np.zeros((2, 3, 1, 4))
+    predicted = truth.copy()
+    predicted[0, 1, 0] = [2.0, 0.0, 0.0, 0.0]
+    assert one_step_mse(predicted, truth) == 4 / truth.size

@@ -287,7 +287,7 @@ def test_a_figure_keeps_only_its_methods(store: Store, spec: RunSpec, monkeypatc
 
 
 def test_a_figure_of_an_ablation_keeps_only_its_specs(store: Store) -> None:
-    inside = ablation_specs("beta", "smoke", [0.5])[0.5]
+    inside = ablation_specs("beta", "smoke", [0.15])[0.15]
     for one in (inside, *ablation_specs("beta", "smoke", [0.123]).values()):
         store.start_run(one, 0, dataset_hash=None, device="cpu")
     assert [row.spec_hash for row in store.runs(figure="fig6")] == [inside.hash()]

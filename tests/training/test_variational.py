@@ -86,7 +86,13 @@ def test_one_step_prediction_reads_the_past_only() -> None:
 def test_a_little_training_beats_constant_velocity_by_one_step(method: str) -> None:
     """Test trajectories, clearly better; negative control: with a learning rate of nothing it does not."""
     for rate, learns in ((0.003, True), (1e-9, False)):
-        chosen = [f"cloning.learning_rate={rate}", "training.epochs=3", "training.updates=40", "training.batch=16"]
+        chosen = [
+            "cloning.input_noise=0.0",
+            f"cloning.learning_rate={rate}",
+            "training.epochs=3",
+            "training.updates=40",
+            "training.batch=16",
+        ]
         chosen += ["data.yjunction.train=64"]
         chosen += ["variational.hidden=16", "variational.decoder_hidden=32"] if method != "bc" else ["model.hidden=16"]
         loop = TrainingLoop(build_spec(method, "yjunction", "smoke", chosen), 0)

@@ -49,7 +49,8 @@ def make_expert_set(splits: dict[str, Trajectories], centre_lines: Floats, param
     ]
     for array in (*arrays, centre_lines):
         digest.update(np.ascontiguousarray(array).tobytes())
-    return ExpertSet(**splits, centre_lines=centre_lines, parameters=parameters, hash=digest.hexdigest())
+    train, validation, test = (splits[split] for split in SPLITS)
+    return ExpertSet(train, validation, test, centre_lines, parameters, digest.hexdigest())
 
 
 def centre_line(params: YJunctionSpec, lane: int, points: int = 200) -> Floats:
