@@ -55,7 +55,8 @@ def prep_mocap(
     if source is None:
         from ssmail.data.mocap.download import fetch
 
-        source = fetch(subject, (*wanted.train, *wanted.validation, *wanted.test), cache)
+        trials = (*wanted.train, *wanted.validation, *wanted.test)
+        source = fetch(subject, trials, cache, allow_missing=allow_missing)
     experts = prepare(source, wanted, allow_missing=allow_missing)
     expert_file.save(experts, out, force=force)
     _tell(experts, out, as_json)

@@ -13,6 +13,7 @@ from ssmail.data import expert_file
 from ssmail.data.mocap import download
 from ssmail.errors import InputError
 from tests.cli.command_line import CommandLine
+from tests.data.mocap import misbehaving_site
 from tests.data.mocap.handmade import amc, write_subject
 
 SMALL = ("--train", "1-2", "--val", "3", "--test", "4")
@@ -130,23 +131,33 @@ def test_an_unwritable_place(cli: CommandLine, folder: Path) -> None:
 def test_downloaded_files_are_a_source(
     cli: CommandLine, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[Any] = []
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
+    monkeypatch.setattr(download.time, "sleep", lambda _: None)
+    out = tmp_path / "set.npz"
+    options = ("prep-mocap", "--download", "--cache", tmp_path / "cache", "--out", out, *SMALL)
+    with misbehaving_site.serving() as site:
+        monkeypatch.setattr(download, "BASE_URL", site.url)
+        site.files = {f"/subjects/35/{file.name}": file.read_bytes() for file in folder.iterdir()}
+        outcome = cli(*options)
+        assert (outcome.code, len(site.asked)) == (0, 5)
+        assert "may not be resold" in outcome.err
+        assert expert_file.load(out).hash == prepared_hash(cli, folder, tmp_path)
+        assert cli(*options).sentence.endswith("overwrite it with --force")
+        assert len(site.asked) == 5, "the site is asked only when the set may be written"
+        del site.files["/subjects/35/35_02.amc"]
+        elsewhere = (*options, "--cache", tmp_path / "empty", "--force")
+        assert "35_02.amc (the server answered 404)" in cli(*elsewhere).err
+        assert cli(*elsewhere, "--allow-missing").code == 0
+        assert expert_file.load(out).parameters["missing"] == [2]
 
-    def fetch(*arguments: Any) -> Path:
-        asked.append(arguments)
-        return folder
 
-    monkeypatch.setattr(download, "fetch", fetch)
-    options = ("prep-mocap", "--download", "--cache", tmp_path / "cache", "--out", tmp_path / "set.npz", *SMALL)
-    assert cli(*options).code == 0
-    assert asked == [(35, (1, 2, 3, 4), tmp_path / "cache")]
-    assert len(expert_file.load(tmp_path / "set.npz").train) == 5
-    assert cli(*options).sentence.endswith("overwrite it with --force")
-    assert len(asked) == 1, "the site is asked only when the set may be written"
+def prepared_hash(cli: CommandLine, folder: Path, tmp_path: Path) -> str:
+    cli("prep-mocap", "--source", folder, "--out", tmp_path / "given.npz", *SMALL)
+    return expert_file.load(tmp_path / "given.npz").hash
 
 
 def test_a_download_that_fails(cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fetch(*_: Any) -> Path:
+    def fetch(*_: Any, **__: Any) -> Path:
         raise InputError("there is no such file")
 
     monkeypatch.setattr(download, "fetch", fetch)
