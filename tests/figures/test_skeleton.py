@@ -1,5 +1,6 @@
 """The skeleton seen from the side: where its joints are, what is left and right, and what the files hold."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -114,15 +115,15 @@ def test_picture_and_csv_show_the_record(data: Path, tmp_path: Path) -> None:
     assert {skeleton.SIDES[side].colour for side in ("left", "right")} <= set(style.AGENTS)
 
 
-def test_nothing_is_cut_off(data: Path) -> None:
-    figure = skeleton.draw(skeleton.collect(data))
+@pytest.mark.parametrize("size", [1, 6])
+def test_nothing_is_cut_off(data: Path, size: float) -> None:
+    """Not even the foot of a letter, whether the skeleton has the size of a mouse or of a person."""
+    record = skeleton.collect(data)
+    figure = skeleton.draw(replace(record, places=size * record.places))
     figure.draw_without_rendering()
-    page = figure.bbox
-    for axes in figure.axes:
-        box = axes.get_tightbbox()
-        assert box is not None
-        assert page.x0 <= box.x0 < box.x1 <= page.x1
-        assert page.y0 <= box.y0 < box.y1 <= page.y1
+    drawn, page = figure.get_tightbbox(), figure.bbox_inches
+    assert page.x0 <= drawn.x0 < drawn.x1 <= page.x1
+    assert page.y0 <= drawn.y0 < drawn.y1 <= page.y1
 
 
 def test_the_film_has_every_third_frame_at_half_speed(data: Path, tmp_path: Path) -> None:

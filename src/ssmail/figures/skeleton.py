@@ -140,7 +140,7 @@ def draw(record: SkeletonRecord) -> Figure:
     with style.sheet():
         scale = (style.COLUMN_WIDTH - 0.5) / len(poses) / (2 * half)  # inches per unit
         figure = style.new_figure(height=scale * (heights[1] - heights[0]) + 0.87)
-        figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.02, wspace=0, hspace=0)
+        figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.03, wspace=0, hspace=0)
         panels = figure.subplots(1, len(poses), sharey=True, squeeze=False)[0]
         for axes, step, pose in zip(panels, record.shown, poses, strict=True):
             middle = float(pose[:, 0].min() + pose[:, 0].max()) / 2
@@ -151,7 +151,7 @@ def draw(record: SkeletonRecord) -> Figure:
                 axes.spines["left"].set_visible(False)
                 axes.tick_params(left=False)
         panels[0].set_ylabel("height (ASF units)")
-        panels[len(poses) // 2].set_xlabel("distance along the walk (ASF units)")
+        figure.supxlabel("distance along the walk (ASF units)", fontsize=8)
         _draw_legend(figure, record)
         return figure
 
