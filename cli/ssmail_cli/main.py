@@ -10,7 +10,7 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
-from ssmail_cli import ablate, data, plot, reproduce, runs, train
+from ssmail_cli import ablate, data, mocap, plot, reproduce, runs, train
 from ssmail_cli.display import complaint
 
 INTERRUPTED = 130
@@ -24,6 +24,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("generate-yjunction")(data.generate_yjunction)
+app.command("prep-mocap")(mocap.prep_mocap)
 app.command("train")(train.train)
 app.command("ablate")(ablate.ablate)
 app.command("ablate-beta")(ablate.alias("beta"))

@@ -1,6 +1,6 @@
-"""`ssmail plot`: figures of the paper, and training curves, from the database alone."""
+"""`ssmail plot`: figures of the paper and training curves from the database alone, and the skeleton from its data."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from ssmail.figures import FigureRecord
     from ssmail.store import RunRow, Store
 
-TRAINING = "training"
+TRAINING, SKELETON = "training", "skeleton"
 DEFAULT_METRIC, DEFAULT_GROUPS = "train/mode_mse", "method"
+DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
 
 OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
 Formats = Annotated[
@@ -32,7 +33,7 @@ def plot(
         list[str],
         typer.Argument(
             metavar="FIGURE...",
-            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), or training.",
+            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), training, skeleton.",
         ),
     ],
     out: OutDir = Path("results/figures"),
@@ -71,25 +72,46 @@ def plot(
             show_default=DEFAULT_GROUPS,
         ),
     ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option("--data", help="skeleton: the file that prep-mocap wrote.", show_default=DEFAULT_DATA),
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option("--split", help="skeleton: train, validation or test.", show_default=DEFAULT_SPLIT),
+    ] = None,
+    window: Annotated[
+        int | None, typer.Option("--window", min=0, help="skeleton: which window of the split.", show_default="0")
+    ] = None,
+    animate: Annotated[
+        bool | None, typer.Option("--animate", help="skeleton: make a film (GIF) too.", show_default=False)
+    ] = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
-    """Draw figures of the paper, or the metrics of any runs over epochs (training).
+    """Draw figures of the paper, the metrics of any runs over epochs (training), or recorded walking (skeleton).
 
     Each comes with a CSV of exactly what it shows, and the ids of the runs stand in the metadata of the files. Prints
     the paths of the files.
     """
     from ssmail.figures import FIGURES
 
-    training_options = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
-    given = [option for option, value in training_options.items() if value is not None]
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
-    _check(figures, formats or [], given)
+    _check(figures, formats or [])
+    training = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
+    skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
+    _check_owner(TRAINING, training, figures)
+    _check_owner(SKELETON, skeleton, figures)
     if ids and profile and figures != [TRAINING]:
         raise InputError("--runs names the runs already; leave --profile out.")
     statistic = _statistic(stat, figures)
-    store = open_store(db)
-    for name in dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures):
-        if name == TRAINING:
+    names = dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures)
+    if set(names) == {SKELETON} and (ids or profile):
+        raise InputError(f"{SKELETON} shows no runs; leave {'--runs' if ids else '--profile'} out.")
+    store = open_store(db) if set(names) != {SKELETON} else None
+    for name in names:
+        if store is None or name == SKELETON:
+            _draw_skeleton(data or Path(DEFAULT_DATA), split or DEFAULT_SPLIT, window or 0, bool(animate), out, formats)
+        elif name == TRAINING:
             chosen = _chosen(store, ids, methods, environment, profile)
             _draw_training(chosen, store, metrics or [DEFAULT_METRIC], group_by, statistic, out, formats)
         else:
@@ -97,23 +119,26 @@ def plot(
             _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)
 
 
-def _check(figures: Sequence[str], formats: Sequence[str], training_options: Sequence[str]) -> None:
-    """Refuse unknown names, and options of training beside figures that know nothing of them."""
+def _check(figures: Sequence[str], formats: Sequence[str]) -> None:
+    """Refuse unknown names."""
     from ssmail.experiments import unknown_name
     from ssmail.figures import FIGURES
     from ssmail.figures.provenance import FORMATS
 
     for name in figures:
-        if name not in FIGURES and name != TRAINING:
-            raise unknown_name("figure", name, [*FIGURES, TRAINING])
+        if name not in FIGURES and name not in (TRAINING, SKELETON):
+            raise unknown_name("figure", name, [*FIGURES, TRAINING, SKELETON])
     for form in formats:
         if form not in FORMATS:
             raise unknown_name("figure format", form, FORMATS)
-    others = [name for name in figures if name != TRAINING]
-    if training_options and others:
-        raise InputError(
-            f"{training_options[0]} belongs to `ssmail plot {TRAINING}`; draw {', '.join(others)} without it."
-        )
+
+
+def _check_owner(owner: str, options: Mapping[str, object], figures: Sequence[str]) -> None:
+    """Refuse the options of one figure beside others that know nothing of them."""
+    given = [option for option, value in options.items() if value is not None]
+    others = [name for name in figures if name != owner]
+    if given and others:
+        raise InputError(f"{given[0]} belongs to `ssmail plot {owner}`; draw {', '.join(others)} without it.")
 
 
 def _statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
@@ -125,7 +150,7 @@ def _statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
         return None
     if stat not in list(Statistic):
         raise unknown_name("statistic", stat, list(Statistic))
-    if not any(name == TRAINING or FIGURES[name].has_statistic for name in figures):
+    if not any(name == TRAINING or (name in FIGURES and FIGURES[name].has_statistic) for name in figures):
         raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
     return Statistic(stat)
 
@@ -165,6 +190,19 @@ def _draw_training(
 
     record = training_curves.collect(store, runs, metrics, group_by or DEFAULT_GROUPS, statistic or Statistic.MEAN_STD)
     _save(TRAINING, record.stem, record, training_curves.draw(record), out, formats)
+
+
+def _draw_skeleton(
+    data: Path, split: str, window: int, animate: bool, out: Path, formats: Sequence[str] | None
+) -> None:
+    from ssmail.figures import skeleton
+
+    record = skeleton.collect(data, split, window)
+    _save(SKELETON, record.stem, record, skeleton.draw(record), out, formats)
+    if animate:
+        film = out / f"{record.stem}.gif"
+        skeleton.save_film(record, film)
+        typer.echo(film)
 
 
 def _save(

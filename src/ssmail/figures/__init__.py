@@ -1,4 +1,5 @@
-"""The figures of the paper, redrawn from the store alone; and `training_curves`, for questions that it does not ask.
+"""The figures of the paper, redrawn from the store alone; `training_curves`, for questions that it does not ask; and
+`skeleton`, a picture of the motion-capture data.
 
 Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
 Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.

@@ -1,6 +1,7 @@
 """Where a figure comes from, written into its files and read back: PNG text chunk, PDF information, SVG metadata.
 
-The record is one line of JSON under one key of each format: `ssmail` (PNG), `Keywords` (PDF), `dc:description` (SVG).
+The record is one line of JSON under one key of each format: `ssmail` (PNG), `Keywords` (PDF), `dc:description` (SVG); a
+film (GIF) has it as its comment.
 No date is written, so that equal runs give equal files.
 """
 
@@ -46,6 +47,11 @@ class Provenance:
             drawn_with=__version__,
         )
 
+    @classmethod
+    def of_data(cls, figure: str, dataset_hash: str) -> Self:
+        """The provenance of a figure drawn from an expert set, without any run."""
+        return cls(figure, (), (), (dataset_hash,), (), __version__)
+
     def as_json(self) -> str:
         """One line of ASCII."""
         return json.dumps(asdict(self), separators=(",", ":"))
@@ -68,19 +74,21 @@ class Provenance:
 
 
 def read(path: Path) -> Provenance:
-    """The provenance inside a PNG, PDF or SVG that ssmail saved.
+    """The provenance inside a PNG, PDF, SVG or GIF that ssmail saved.
 
     Raises InputError for a file that cannot be read or that carries none.
     """
-    readers = {".png": _png_text, ".pdf": _pdf_text, ".svg": _svg_text}
+    readers = {".png": _png_text, ".pdf": _pdf_text, ".svg": _svg_text, ".gif": _gif_comment}
     reader = readers.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"{path} is no figure of ssmail; give a file that ends in .png, .pdf or .svg.")
+        raise InputError(f"{path} is no figure of ssmail; give a file that ends in .png, .pdf, .svg or .gif.")
     try:
         return Provenance.from_json(reader(path))
     except OSError as error:
         if isinstance(error, UnidentifiedImageError):
-            raise InputError(f"{path} is not a PNG image; draw it again with `ssmail plot`.") from None
+            raise InputError(
+                f"{path} is not a {path.suffix[1:].upper()} image; draw it again with `ssmail plot`."
+            ) from None
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
     except (ValueError, TypeError, KeyError, ElementTree.ParseError):
         raise InputError(f"{path} carries no run ids of ssmail; draw it again with `ssmail plot`.") from None
@@ -98,6 +106,12 @@ def _code(run: RunRow) -> str:
 def _png_text(path: Path) -> str:
     with Image.open(path, formats=["PNG"]) as image:
         return str(image.info["ssmail"])
+
+
+def _gif_comment(path: Path) -> str:
+    with Image.open(path, formats=["GIF"]) as image:
+        comment: bytes = image.info["comment"]
+    return comment.decode("ascii")
 
 
 def _pdf_text(path: Path) -> str:

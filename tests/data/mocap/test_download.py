@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.data.mocap import download
+from ssmail.data.mocap.source import LARGEST
 from ssmail.errors import InputError, SsmailError
 from tests.data.mocap import misbehaving_site as site_that
 from tests.data.mocap.misbehaving_site import (
@@ -157,14 +158,16 @@ def test_passing_failures_are_tried_again_after_growing_waits(
     ]
 
 
-def test_failures_that_do_not_pass_end_it(fetch: Fetch, site: Site) -> None:
+def test_failures_that_do_not_pass_end_it(fetch: Fetch, site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
     site.misbehaves("35.asf", *[status(500)] * 3)
     with pytest.raises(SsmailError, match=r"35\.asf could not be downloaded: the server answered 500; later the same"):
         fetch()
     assert len(site.asked) == 3
     site.misbehaves("35.asf", status(503, Retry_After="86400"))
-    with pytest.raises(SsmailError, match="answered 503"):
-        fetch()
+    with monkeypatch.context() as patch:
+        patch.setattr(time, "sleep", pytest.fail)
+        with pytest.raises(SsmailError, match="answered 503"):
+            fetch()
     assert len(site.asked) == 4, "nobody waits for a day"
     site.misbehaves("35.asf", status(403))
     with pytest.raises(SsmailError, match="answered 403; look at it in a browser"):
@@ -177,6 +180,14 @@ def test_a_trial_that_there_is_not(fetch: Fetch, site: Site, tmp_path: Path) -> 
         fetch([1, 9])
     assert len(site.asked) == 3, "404 is not tried again"
     assert not (tmp_path / "cache/35/35_09.amc").exists()
+
+
+def test_a_missing_trial_can_be_insisted_on(fetch: Fetch, site: Site) -> None:
+    said: list[str] = []
+    assert_whole(fetch([1, 9, 2], said, allow_missing=True), site)
+    assert said[3:] == ["35_01.amc: 7 kB [2/4]", "35_09.amc: not there [3/4]", "35_02.amc: 7 kB [4/4]"]
+    with pytest.raises(InputError, match=r"there is no http\S+/36\.asf"):
+        fetch([1], subject=36, allow_missing=True)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +230,7 @@ def test_chunks_tell_their_end(fetch: Fetch, site: Site) -> None:
 
 
 def test_a_file_without_end_is_given_up(fetch: Fetch, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download, "LARGEST", 2000)
+    monkeypatch.setitem(LARGEST, ".amc", 2000)
     with pytest.raises(SsmailError, match=r"35_01\.amc is larger than"):
         fetch()
 

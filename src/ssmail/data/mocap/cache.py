@@ -12,17 +12,12 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from ssmail.errors import InputError, SsmailError
+from ssmail.spec import Frozen
 
 RECORD = "downloads.json"
-
-
-class Frozen(BaseModel):
-    """Immutable; an unknown key or a value of the wrong type is an error."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class Whole(Frozen):
@@ -49,8 +44,8 @@ class Partial(Frozen):
 class Record(Frozen):
     """What `downloads.json` holds, by file name."""
 
-    whole: dict[str, Whole] = {}
-    partial: dict[str, Partial] = {}
+    whole: dict[str, Whole] = Field(default_factory=dict)
+    partial: dict[str, Partial] = Field(default_factory=dict)
 
 
 class Cache:

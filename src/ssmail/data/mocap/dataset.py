@@ -63,9 +63,9 @@ def parse_trials(text: str, option: str) -> tuple[int, ...]:
         found = re.fullmatch(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?", part, re.ASCII)
         first, last = (int(found[1]), int(found[2] or found[1])) if found else (0, 0)
         if first < 1 or len(text) > MOST_TRIALS:
-            raise InputError(f"{option} takes trials such as 01-12 or 1-3,7, not {shown(text[:40])!r}")
+            raise InputError(f"{option} takes trials such as 01-12 or 1-3,7, not {text[:40]!r}")
         if last < first:
-            raise InputError(f"the range {part.strip()} in {option} runs backwards; write {last:02d}-{first:02d}")
+            raise InputError(f"the range {first:02d}-{last:02d} in {option} runs backwards; swap its ends")
         if len(trials) + last - first >= MOST_TRIALS:
             raise InputError(f"{option} names more than {MOST_TRIALS} trials; name fewer")
         trials += range(first, last + 1)

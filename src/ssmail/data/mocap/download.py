@@ -18,6 +18,7 @@ from pathlib import Path
 
 from ssmail import __version__
 from ssmail.data.mocap.cache import Cache, Partial, open_cache
+from ssmail.data.mocap.source import LARGEST
 from ssmail.errors import InputError, SsmailError
 
 BASE_URL = "http://mocap.cs.cmu.edu/subjects"
@@ -28,11 +29,14 @@ LICENCE = (
 )
 PASSING = frozenset({408, 429, 500, 502, 503, 504})  # answers that may be better a little later
 PATIENCE = 120.0  # the longest that a server's Retry-After is obeyed, in seconds
-LARGEST = 128 * 2**20  # bytes of one file; the trials of subject 35 have 0.3 MB
 SLOWEST = 20.0  # one request may take so many timeouts, however the bytes trickle
 AGAIN = "the same command goes on from here"
 
 Report = Callable[[str], None]
+
+
+class AbsentError(InputError):
+    """The site has no such file."""
 
 
 class _RequestError(Exception):
@@ -62,7 +66,8 @@ def fetch(
     trials: Sequence[int | str],
     cache: Path,
     *,
-    base_url: str = BASE_URL,
+    allow_missing: bool = False,
+    base_url: str | None = None,
     pause_seconds: float = 1.5,
     backoff_seconds: float = 2.0,
     timeout_seconds: float = 30.0,
@@ -72,14 +77,16 @@ def fetch(
     """The folder `cache`/SUBJECT, holding SUBJECT.asf and SUBJECT_TRIAL.amc of all the trials, each whole.
 
     Numbers are those of the site: subject 35, trials 1 or "01". What is missing is downloaded from
-    `base_url`/SUBJECT/, with `pause_seconds` between files; a request that fails is repeated up to `attempts` times,
-    after `backoff_seconds`, then twice that, and so on. `report` gets the licence and the progress, line by line;
-    standard error by default. Interrupted at any moment, the next call goes on where this one stopped.
+    `base_url`/SUBJECT/ (BASE_URL by default), with `pause_seconds` between files; a request that fails is repeated up
+    to `attempts` times, after `backoff_seconds`, then twice that, and so on. `report` gets the licence and the
+    progress, line by line; standard error by default. Interrupted at any moment, the next call goes on where this one
+    stopped.
 
-    Raises InputError for a number that the site does not have, and for a cache that cannot be used or was changed;
-    SsmailError when the site cannot be reached, sends something else than the file, or another file than on an
-    earlier visit.
+    Raises InputError for a subject or, unless `allow_missing`, a trial that the site does not have, and for a cache
+    that cannot be used or was changed; SsmailError when the site cannot be reached, sends something else than the
+    file, or another file than on an earlier visit.
     """
+    base_url = base_url or BASE_URL
     if not re.fullmatch(r"https?://[^\s/?#]+[^\s?#]*", base_url):
         raise InputError(f"'{base_url}' is no address to download from; it must begin with http:// or https://")
     site = _Site(base_url.rstrip("/"), timeout_seconds, attempts, backoff_seconds, report or _to_stderr)
@@ -94,8 +101,14 @@ def fetch(
         for count, name in enumerate(missing, start=1):
             if count > 1:
                 time.sleep(pause_seconds)
-            size = _download(site, folder, name, f"{site.base_url}/{who}/{name}")
-            site.report(f"{name}: {size / 1000:.0f} kB [{count}/{len(missing)}]")
+            try:
+                size = _download(site, folder, name, f"{site.base_url}/{who}/{name}")
+            except AbsentError:
+                if not allow_missing or name == names[0]:
+                    raise
+                site.report(f"{name}: not there [{count}/{len(missing)}]")
+            else:
+                site.report(f"{name}: {size / 1000:.0f} kB [{count}/{len(missing)}]")
         return folder.folder
 
 
@@ -172,8 +185,8 @@ def _request(site: _Site, cache: Cache, name: str, url: str) -> None:
         with cache.part(name).open("ab") as file:
             for chunk in _chunks(response, site.timeout):
                 file.write(chunk)
-                if file.tell() > LARGEST:
-                    raise SsmailError(f"{url} is larger than {LARGEST >> 20} MB, so it is no file of the database")
+                if file.tell() > LARGEST[name[-4:]]:
+                    raise SsmailError(f"{url} is larger than any such file of the database; look at it in a browser")
     have = cache.arrived(name)
     if size is not None and have != size:
         raise _RequestError(f"the connection was cut after {have} of {size} bytes", restart=have > size)
@@ -197,7 +210,7 @@ def _refusal(url: str, error: urllib.error.HTTPError) -> Exception:
     """What an answer other than the file means."""
     answer = f"the server answered {error.code}"
     if error.code in (404, 410):
-        return InputError(f"there is no {url} ({answer}); check the numbers of the subject and of its trials")
+        return AbsentError(f"there is no {url} ({answer}); check the numbers of the subject and of its trials")
     if error.code == 416:
         return _RequestError(f"{answer}: it has fewer bytes than came before", restart=True)
     if error.code in PASSING:

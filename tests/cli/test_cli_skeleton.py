@@ -1,0 +1,62 @@
+"""`ssmail plot skeleton`: from a prepared set, without any run."""
+
+from pathlib import Path
+
+import pytest
+
+from ssmail.data import expert_file
+from ssmail.data.mocap.dataset import MocapParameters, prepare
+from ssmail.figures import skeleton
+from tests.cli.command_line import CommandLine
+from tests.data.mocap.handmade import write_subject
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> Path:
+    source = write_subject(tmp_path / "source", {1: 60, 2: 60, 3: 120})
+    path = tmp_path / "mocap.npz"
+    wanted = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,))
+    expert_file.save(prepare(source, wanted), path)
+    return path
+
+
+def test_it_needs_neither_runs_nor_a_database(cli: CommandLine, data: Path, tmp_path: Path) -> None:
+    out, nowhere = tmp_path / "figures", tmp_path / "absent.db"
+    outcome = cli("plot", "skeleton", "--data", data, "--out", out, "--db", nowhere, "--format", "svg")
+    assert outcome.code == 0
+    assert [Path(line).name for line in outcome.out.splitlines()] == ["skeleton_test-0.svg", "skeleton_test-0.csv"]
+    assert outcome.err == "skeleton: test window 0 of 0-0: trial 35_03 from frame 2 on.\n"
+    assert not nowhere.exists()
+
+
+def test_a_film_of_another_split(cli: CommandLine, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(skeleton, "STRIDE", 25)  # two pictures instead of 17
+    options = ("--data", data, "--split", "train", "--window", 0, "--animate", "--out", tmp_path / "figures")
+    names = [Path(line).name for line in cli("plot", "skeleton", *options).out.splitlines()]
+    assert names == ["skeleton_train-0.png", "skeleton_train-0.csv", "skeleton_train-0.gif"]
+    assert all((tmp_path / "figures" / name).stat().st_size for name in names)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ("skeleton", "there is no file data/mocap.npz; make it with `ssmail prep-mocap"),
+        ("skeleton --window 1", "there is no file data/mocap.npz"),
+        ("skeleton --window -1", "'--window': it should be greater than or equal to 0"),
+        ("skeleton --split tets", "unknown split 'tets'; did you mean test?"),
+        ("skeleton --runs ab", "skeleton shows no runs; leave --runs out."),
+        ("skeleton --profile quick", "skeleton shows no runs; leave --profile out."),
+        ("skeleton --stat mean-ci", "skeleton shows no centre and band; leave --stat out."),
+        ("skeleton --metric a", "--metric belongs to `ssmail plot training`; draw skeleton without it."),
+        ("fig4 --animate", "--animate belongs to `ssmail plot skeleton`; draw fig4 without it."),
+        ("training skeleton --window 0", "--window belongs to `ssmail plot skeleton`; draw training without it."),
+        ("skeletn", "unknown figure 'skeletn'; did you mean skeleton?"),
+    ],
+)
+def test_what_does_not_go_together_is_said(
+    cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, sentence: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outcome = cli("plot", *arguments.split())
+    assert outcome.code == 2
+    assert sentence in outcome.sentence
