@@ -27,6 +27,8 @@ SPEC = ModelSpec(
     action_bound=1.5,
     log_std_min=-5.0,
     log_std_max=0.0,
+    root_relative=False,
+    agent_input=False,
 )
 
 sizes = st.tuples(st.integers(1, 3), st.integers(1, 4), st.integers(1, 5), st.integers(1, 6))  # B, T, N, D

@@ -116,7 +116,7 @@ class Plan:
 def _check_data(cell: Cell, row: RunRow) -> None:
     """Raise InputError when the spec names a data file that is no longer the one of the finished run `row`."""
     path = cell.spec.data.path
-    if path is not None and load(Path(path)).hash != row.dataset_hash:
+    if path is not None and load(Path(path), cell.spec.environment).hash != row.dataset_hash:
         raise InputError(f"{path} has changed since run {row.name} was trained on it; train afresh with --resume never")
 
 

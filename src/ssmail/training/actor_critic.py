@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
@@ -17,18 +17,9 @@ from ssmail.models.policy import GraphPolicy
 from ssmail.spec import SacSpec
 from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
+from ssmail.training.updates import clipped_step
 
 Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions (B, T, N, A) -> rewards (B, T, N)
-
-
-def clipped_step(
-    optimizer: torch.optim.Optimizer, loss: Tensor, parameters: Iterable[Tensor], gradient_clip: float
-) -> None:
-    """One step down the gradient of `loss`, its norm over `parameters` kept at or below `gradient_clip`."""
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()  # type: ignore[no-untyped-call]
-    nn.utils.clip_grad_norm_(parameters, gradient_clip)
-    optimizer.step()
 
 
 @dataclass(frozen=True)

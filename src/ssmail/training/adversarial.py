@@ -18,18 +18,14 @@ from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.rewards import gail_reward, ssail_reward, wail_reward
 from ssmail.spec import Pairing, SelfSupervisionSpec, used
-from ssmail.training.actor_critic import ActorCritic, clipped_step
-from ssmail.training.curricula import (
-    draw_interventions,
-    expected_segment_length,
-    intervention_frequency,
-    mean_segment_length,
-)
-from ssmail.training.learning import Setting, mean_of
+from ssmail.training.actor_critic import ActorCritic
+from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
+from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.policy_predictor import PolicyPredictor
 from ssmail.training.replay import Batch, Replay
 from ssmail.training.rollout import rollout
+from ssmail.training.updates import clipped_step, mean_of, with_noise
 
 
 @dataclass(frozen=True)
@@ -93,17 +89,13 @@ class AdversarialLearner:
         """Roll out, then update."""
         frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
         self.rates.set(epoch)
-        latest, segment = self.generate(frequency)
+        latest, interventions = self.generate(frequency)
         self.replay.add(latest)
         values = mean_of([self.update(latest) for _ in range(self.training.updates)])
-        return values | {
-            "curriculum/intervention_frequency": frequency,
-            "curriculum/segment_length": segment,
-            "curriculum/expected_segment_length": expected_segment_length(frequency, self.setting.steps),
-        }
+        return values | curriculum_metrics(frequency, [interventions])
 
-    def generate(self, frequency: float) -> tuple[Batch, float]:
-        """tau_G from random training starts under the curriculum, and their mean segment length."""
+    def generate(self, frequency: float) -> tuple[Batch, Tensor]:
+        """tau_G from random training starts under the curriculum, and the interventions (B, T)."""
         count, steps = self.adversarial.rollouts, self.setting.steps
         source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
         interventions = draw_interventions(count, steps, frequency, self.generators["curriculum"])
@@ -118,7 +110,7 @@ class AdversarialLearner:
             expert=expert,
             interventions=interventions.to(self.device) if frequency > 0 else None,
         )
-        return Batch(made.states, made.actions, source), mean_segment_length(interventions)
+        return Batch(made.states, made.actions, source), interventions
 
     def update(self, latest: Batch) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
@@ -129,10 +121,10 @@ class AdversarialLearner:
     def _update_discriminator(self, latest: Batch) -> dict[str, float]:
         b = self.training.batch
         past = round(b * self.adversarial.past_share)
-        parts = [self._pick(latest, b - past)] if past < b else []
+        parts = [latest.draw(b - past, self.generators["data"])] if past < b else []
         if past:
             parts.append(self.replay.sample(past, self.generators["data"]))
-        batches = [Batch.concatenate(parts), self._pick(self.experts, b)]
+        batches = [Batch.concatenate(parts), self.experts.draw(b, self.generators["data"])]
         labels: tuple[Tensor, ...] = ()
         if self.supervision:
             mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
@@ -177,16 +169,13 @@ class AdversarialLearner:
         limit = self.adversarial.reward_limit
         return reward if limit is None else reward.clamp(-limit, limit)
 
-    def _pick(self, source: Batch, count: int) -> Batch:
-        return source[torch.randint(len(source), (count,), generator=self.generators["data"]).to(self.device)]
-
     def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
         """The expert trajectory that each generated one is mixed with."""
         if pairing == "start":
             return self.experts[generated.source]
         if pairing == "nearest":
             return self.experts[nearest(generated.states, self.experts.states)]
-        drawn = self._pick(self.experts, len(generated))
+        drawn = self.experts.draw(len(generated), self.generators["data"])
         return drawn[assignment(generated.states, drawn.states)]
 
     def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
@@ -206,11 +195,8 @@ class AdversarialLearner:
         """`inputs` with Gaussian noise on the first `features` of them (all by default), so that D judges the track,
         not the jitter.
         """
-        std = self.adversarial.input_noise
-        if std == 0:
-            return inputs
-        noise = torch.randn(*inputs[..., :features].shape, generator=self.generators["data"]).to(self.device)
-        return torch.cat([inputs[..., :features] + std * noise, inputs[..., noise.shape[-1] :]], dim=-1)
+        noisy = with_noise(inputs[..., :features], self.adversarial.input_noise, self.generators["data"])
+        return noisy if features is None else torch.cat([noisy, inputs[..., features:]], dim=-1)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that an epoch changes, but for the generators."""

@@ -8,10 +8,10 @@ from torch import nn
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.spec import used
-from ssmail.training.actor_critic import clipped_step
-from ssmail.training.learning import Setting, mean_of
+from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.policy_predictor import PolicyPredictor
+from ssmail.training.updates import clipped_step, mean_of, with_noise
 
 
 class CloningLearner:
@@ -43,12 +43,9 @@ class CloningLearner:
         return mean_of([self._update() for _ in range(self.training.updates)])
 
     def _update(self) -> dict[str, float]:
-        experts, generator = self.setting.experts, self.generators["data"]
-        batch = experts[torch.randint(len(experts), (self.training.batch,), generator=generator).to(self.device)]
-        states = batch.states[:, :-1]
-        b, t, n, _ = states.shape
-        noise = torch.randn(states.shape, generator=generator).to(self.device)
-        read = states + self.cloning.input_noise * noise
+        batch = self.setting.experts.draw(self.training.batch, self.generators["data"])
+        read = with_noise(batch.states[:, :-1], self.cloning.input_noise, self.generators["data"])
+        b, t, n, _ = read.shape
         x = self.predictor.features(read, batch.states[:, 0])
         graph_noise = self.policy.draw_graph_noise(b, t, n, self.generators["policy"]).to(self.device)
         graphs, _, _ = self.policy.graphs(x, graph_noise)

@@ -71,3 +71,14 @@ def expected_segment_length(frequency: float, steps: int) -> float:
     first may be interventions.
     """
     return steps / (1 + (steps - 1) * frequency)
+
+
+def curriculum_metrics(frequency: float, interventions: list[Tensor]) -> dict[str, float]:
+    """What is stored of an epoch's curriculum: the frequency, and the mean segment length over its masks (B, T), as
+    measured and as expected.
+    """
+    return {
+        "curriculum/intervention_frequency": frequency,
+        "curriculum/segment_length": sum(map(mean_segment_length, interventions)) / len(interventions),
+        "curriculum/expected_segment_length": expected_segment_length(frequency, interventions[0].shape[1]),
+    }

@@ -86,8 +86,3 @@ class Learner(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`."""
         ...
-
-
-def mean_of(logs: list[dict[str, float]]) -> dict[str, float]:
-    """The mean of each value over records of equal keys."""
-    return {name: sum(log[name] for log in logs) / len(logs) for name in logs[0]}

@@ -32,7 +32,9 @@ class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fau
 
 def expert_set(spec: RunSpec) -> ExpertSet:
     """The expert data of a spec: its file, or the generator's set when it names none."""
-    return generate(used(spec.data.yjunction)) if spec.data.path is None else load(Path(spec.data.path))
+    if spec.data.path is None:
+        return generate(used(spec.data.yjunction))
+    return load(Path(spec.data.path), spec.environment)
 
 
 class TrainingLoop:

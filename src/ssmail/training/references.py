@@ -9,8 +9,19 @@ from torch import Tensor
 from ssmail.envs.integrator import Integrator
 
 
+class Stateless:
+    """Has nothing to save."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+
+
 @dataclass(frozen=True)
-class ConstantVelocity:
+class ConstantVelocity(Stateless):
     """Every agent takes the velocity that is read of the state it is predicted from."""
 
     integrator: Integrator
@@ -38,16 +49,9 @@ class ConstantVelocity:
     def _next(self, state: Tensor, read: Tensor) -> Tensor:
         return self.integrator.step(state, read[..., read.shape[-1] // 2 :])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
-
 
 @dataclass(frozen=True)
-class CopyLast:
+class CopyLast(Stateless):
     """Every state, velocities included, is the last observed one as it was read."""
 
     def free_run(
@@ -68,15 +72,8 @@ class CopyLast:
         """See Predictor."""
         return states[:, :-1]
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
-
-
-class NothingToLearn:
+class NothingToLearn(Stateless):
     """The learner of a reference."""
 
     def __init__(self, predictor: ConstantVelocity | CopyLast) -> None:
@@ -89,10 +86,3 @@ class NothingToLearn:
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Never called: the spec of a reference has no training epochs."""
         raise NotImplementedError("a reference has nothing to learn")
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""

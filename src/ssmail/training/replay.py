@@ -23,6 +23,10 @@ class Batch:
     def __getitem__(self, index: Tensor) -> "Batch":
         return Batch(self.states[index], self.actions[index], self.source[index])
 
+    def draw(self, count: int, generator: torch.Generator) -> "Batch":
+        """`count` of them, uniformly with replacement."""
+        return self[torch.randint(len(self), (count,), generator=generator).to(self.states.device)]
+
     @staticmethod
     def concatenate(parts: "list[Batch]") -> "Batch":
         """Join along the batch axis."""
@@ -45,7 +49,7 @@ class Replay:
         """`count` trajectories, uniformly with replacement. Raises ValueError while empty."""
         if self.kept is None:
             raise ValueError("the replay is empty")
-        return self.kept[torch.randint(len(self.kept), (count,), generator=generator)]
+        return self.kept.draw(count, generator)
 
     def state_dict(self) -> dict[str, Any]:
         """Tensors to continue from."""

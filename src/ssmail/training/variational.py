@@ -2,6 +2,8 @@
 (Kipf et al. 2018; Graber and Schwing 2020).
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
@@ -15,15 +17,10 @@ from ssmail.models.decoders import make_decoder
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from ssmail.spec import VariationalSpec, used
-from ssmail.training.actor_critic import clipped_step
-from ssmail.training.curricula import (
-    draw_interventions,
-    expected_segment_length,
-    intervention_frequency,
-    mean_segment_length,
-)
-from ssmail.training.learning import Setting, mean_of
+from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
+from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
+from ssmail.training.updates import clipped_step, mean_of, with_noise
 
 
 class VariationalModel(nn.Module):
@@ -61,6 +58,17 @@ class VariationalModel(nn.Module):
     def draw_noise(self, batch: int, steps: int, agents: int, generator: torch.Generator) -> Tensor:
         """Gumbel noise for the graphs of `batch` trajectories."""
         return self.graph_noise.draw(batch, steps, agents, self.spec.edge_types, generator)
+
+
+@contextmanager
+def evaluation_mode(model: nn.Module) -> Iterator[None]:
+    """Batch norm uses its running statistics inside."""
+    was_training = model.training
+    model.eval()
+    try:
+        yield
+    finally:
+        model.train(was_training)
 
 
 class _Graphs:
@@ -101,36 +109,32 @@ class VariationalPredictor:
         """See Predictor. dnri's graphs are drawn from its prior; nri's one graph from its posterior given what was
         observed. A recurrent decoder has read the observed states too.
         """
-        was_training = self.model.training
-        self.model.eval()
-        b, h, n, _ = observed.shape
-        noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
-        gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (not deterministic)
-        graphs = _Graphs(self.model, observed + noise[:, :h], gumbel)
-        memory: Tensor | None = None
-        if h > 1:
-            past = observed[:, :-1] + noise[:, : h - 1]
-            _, memory = self.model.decoder(past, graphs.of(past))
-        state = observed[:, -1:]
-        states = [state]
-        for t in range(h - 1, h - 1 + steps):
-            read = state + noise[:, t : t + 1]
-            action, memory = self.model.decoder(read, graphs.of(read), memory)
-            state = self.integrator.step(state, action)
-            states.append(state)
-        self.model.train(was_training)
+        with evaluation_mode(self.model):
+            b, h, n, _ = observed.shape
+            noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
+            gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (not deterministic)
+            graphs = _Graphs(self.model, observed + noise[:, :h], gumbel)
+            memory: Tensor | None = None
+            if h > 1:
+                past = observed[:, :-1] + noise[:, : h - 1]
+                _, memory = self.model.decoder(past, graphs.of(past))
+            state = observed[:, -1:]
+            states = [state]
+            for t in range(h - 1, h - 1 + steps):
+                read = state + noise[:, t : t + 1]
+                action, memory = self.model.decoder(read, graphs.of(read), memory)
+                state = self.integrator.step(state, action)
+                states.append(state)
         return torch.cat(states, dim=1)
 
     @torch.no_grad()
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """See Predictor. Under graphs sampled from what the past tells of them."""
-        was_training = self.model.training
-        self.model.eval()
         now = states[:, :-1]
         noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
-        graphs = self.model.sample(self.model.past_logits(now), noise)
-        action, _ = self.model.decoder(now, graphs)
-        self.model.train(was_training)
+        with evaluation_mode(self.model):
+            graphs = self.model.sample(self.model.past_logits(now), noise)
+            action, _ = self.model.decoder(now, graphs)
         return self.integrator.step(now, action)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "VariationalPredictor":
@@ -176,21 +180,20 @@ class VariationalLearner:
         """training.updates gradient steps under the curriculum."""
         self.rates.set(epoch)
         frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
-        values = mean_of([self._update(frequency) for _ in range(self.training.updates)])
-        return values | {
-            "curriculum/intervention_frequency": frequency,
-            "curriculum/expected_segment_length": expected_segment_length(frequency, self.setting.steps),
-        }
+        batch, steps, updates = self.training.batch, self.setting.steps, self.training.updates
+        curriculum = self.generators["curriculum"]
+        interventions = [draw_interventions(batch, steps, frequency, curriculum) for _ in range(updates)]
+        return mean_of([self._update(mask) for mask in interventions]) | curriculum_metrics(frequency, interventions)
 
-    def _update(self, frequency: float) -> dict[str, float]:
-        experts, b = self.setting.experts, self.training.batch
-        batch = experts[torch.randint(len(experts), (b,), generator=self.generators["data"]).to(self.device)]
+    def _update(self, interventions: Tensor) -> dict[str, float]:
+        b = self.training.batch
+        batch = self.setting.experts.draw(b, self.generators["data"])
         states = batch.states[:, :-1]
-        interventions = draw_interventions(b, states.shape[1], frequency, self.generators["curriculum"])
         posterior, prior = self.model.posterior(states)
         noise = self.model.draw_noise(b, states.shape[1], states.shape[2], self.generators["policy"])
         graphs = self.model.sample(posterior, noise.to(self.device))
-        predicted = self._decode(self._noisy(states), graphs, interventions.to(self.device))
+        read = with_noise(states, self.cloning.input_noise, self.generators["data"])
+        predicted = self._decode(read, graphs, interventions.to(self.device))
         loss, terms = variational_loss(
             predicted,
             batch.states[:, 1:],
@@ -200,12 +203,7 @@ class VariationalLearner:
             kl_weight=self.variational.kl_weight,
         )
         clipped_step(self.optimizer, loss, self.model.parameters(), self.training.gradient_clip)
-        logs = {f"cloning/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
-        return logs | {"curriculum/segment_length": mean_segment_length(interventions)}
-
-    def _noisy(self, states: Tensor) -> Tensor:
-        noise = torch.randn(states.shape, generator=self.generators["data"]).to(self.device)
-        return states + self.cloning.input_noise * noise
+        return {f"cloning/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
 
     def _decode(self, states: Tensor, graphs: Tensor, interventions: Tensor) -> Tensor:
         """Predicted next states (B, T, N, D); all steps at once where every input is the expert's."""
