@@ -1,6 +1,7 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -223,9 +224,10 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> None:
     """A table for each spec: its seeds downwards, then mean, std and median; the metrics across."""
     names = {metric: metric.replace("_constant_velocity", " constant velocity") for metric in metrics}
-    columns = {"seed": "seed", **{metric: name.replace("/", "/\n") for metric, name in names.items()}}
-    for first in found[:: len(metrics)]:
-        group = [item for item in found if item.spec_hash == first.spec_hash]
+    headings = {metric: name.replace("/", "/\n") for metric, name in names.items()}
+    specs = _by_spec(found)
+    for group in specs:
+        first = group[0]
         rows: list[dict[str, Any]] = [
             {"seed": _seed_label(first, seed), **{item.metric: item.values[seed] for item in group}}
             for seed in first.values
@@ -234,23 +236,28 @@ def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> Non
             rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
         differs = "".join(f", {key}={short(value)}" for key, value in first.differs.items())
         print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
-        print_table(rows, columns)
+        print_table(rows, {"seed": "seed", **headings})
         print()
-    if len(found) > len(metrics):
-        _print_overview(found, metrics, columns)
+    if len(specs) > 1:
+        _print_overview(specs, headings)
 
 
-def _print_overview(found: "list[Comparison]", metrics: Sequence[str], columns: Mapping[str, str]) -> None:
+def _by_spec(found: "list[Comparison]") -> "list[list[Comparison]]":
+    """Those of one spec, a metric each, together; they follow one another already."""
+    return [list(group) for _, group in groupby(found, key=lambda item: item.spec_hash)]
+
+
+def _print_overview(specs: "list[list[Comparison]]", headings: Mapping[str, str]) -> None:
     """A row for each spec; `seeds` tells how many of its seeds have the first metric."""
     rows: list[dict[str, Any]] = []
-    for first in found[:: len(metrics)]:
-        group = [item for item in found if item.spec_hash == first.spec_hash]
+    for group in specs:
+        first = group[0]
         differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
         spec = f"{first.method} {differs or first.spec_hash[:8]}"
         seeds = f"{len(first.known)}/{len(first.values)}"
         rows.append({"spec": spec, "seeds": seeds, **{item.metric: _mean_and_std(item) for item in group}})
     print("mean ± standard deviation; seeds: how many have the first metric, of how many")
-    print_table(rows, {"spec": "spec", "seeds": "seeds", **{metric: columns[metric] for metric in metrics}})
+    print_table(rows, {"spec": "spec", "seeds": "seeds", **headings})
 
 
 def _mean_and_std(item: "Comparison") -> str | None:
