@@ -114,7 +114,21 @@ def test_a_whole_number_is_a_float_and_gives_the_same_spec() -> None:
             "'scheduled-sampling'.",
         ),
         ("sac.temperature=.inf", "sac.temperature = .inf in --set should be a finite number."),
-        ("self_supervision.alpha_low=3", "self_supervision: alpha_low 3 is above alpha_high 1; swap them."),
+        (
+            "self_supervision.alpha=[3,1]",
+            "self_supervision.alpha: the range from 3 to 1 ends before it begins; swap them.",
+        ),
+        *(
+            (
+                f"self_supervision.alpha={wrong}",
+                "self_supervision.alpha: takes a range [low, high], or weighted ranges [[low, high, weight], ...].",
+            )
+            for wrong in ("0.5", "[]", "[0]", "[0,1,2]", "[[0,1]]", "[[0,1,1],2]", "[true,1]", "[.nan,1]", "[a,b]")
+        ),
+        (
+            "self_supervision.alpha=[[0,1,0]]",
+            "self_supervision.alpha: the weight 0 of the range from 0 to 1 is not above 0.",
+        ),
         ("sac=3", "sac = 3 in --set is a section, not a value; set one of its keys such as sac.gamma."),
         ("method=gail", "'method' in --set cannot be set there; give it with --method."),
         ("environment=x", "'environment' in --set cannot be set there; give it with --env."),
@@ -269,7 +283,10 @@ def test_a_bad_ablation_is_one_sentence(name: str, values: Any, overrides: list[
         ({"kye": "x"}, "unknown key 'kye' in ablations.beta of e.yaml; did you mean key?"),
         ({"key": "curriculum.bta"}, "unknown key 'curriculum.bta' in ablations.beta of e.yaml; "),
         ({"values": [3]}, "curriculum.beta = 3 in ablations.beta of e.yaml should be less than or equal to 1."),
-        ({"method": "bc"}, "method bc has no section 'curriculum' to set in ablations.beta of e.yaml; it belongs to "),
+        (
+            {"method": "bc"},
+            "method bc on yjunction has no section 'curriculum' to set in ablations.beta of e.yaml; it belongs to ",
+        ),
         ({"method": "ssial"}, "unknown method 'ssial'; did you mean ssail?"),
         ({"settings": {"sac": {"gama": 1}}}, "unknown key 'sac.gama' in ablations.beta.settings of e.yaml; did you "),
     ],

@@ -5,9 +5,10 @@ No field has a default here: each default is written once, in experiments.yaml (
 
 import hashlib
 import json
+import math
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 Count = Annotated[int, Field(ge=1)]
 NonNegativeCount = Annotated[int, Field(ge=0)]
@@ -117,20 +118,49 @@ class AdversarialSpec(Frozen):
     reward_limit: Positive | None  # rewards are kept within plus and minus this, after scaling; null: as they are
 
 
+def read_alpha(value: Any) -> Any:
+    """The density of alpha from what a file or the command line gives: a range [low, high] -> (low, high), or weighted
+    ranges [[low, high, weight], ...] -> ((low, high, weight), ...), a piecewise constant density whose weights are
+    relative. Raises ValueError for anything else.
+    """
+    ranges = value if _is_list(value) and value and all(map(_is_list, value)) else [value]
+    numbers = 2 if ranges is not value else 3
+    for part in ranges:
+        if not _is_list(part) or len(part) != numbers or not all(map(_is_number, part)):
+            raise ValueError("takes a range [low, high], or weighted ranges [[low, high, weight], ...]")
+        if part[0] > part[1]:
+            raise ValueError(f"the range from {part[0]:g} to {part[1]:g} ends before it begins; swap them")
+        if numbers == 3 and part[2] <= 0:
+            raise ValueError(f"the weight {part[2]:g} of the range from {part[0]:g} to {part[1]:g} is not above 0")
+    pieces = tuple(tuple(map(float, part)) for part in ranges)
+    return pieces if numbers == 3 else pieces[0]
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, (list, tuple))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+AlphaPiece = tuple[float, float, float]
+AlphaDensity = Annotated[tuple[float, float] | tuple[AlphaPiece, ...], BeforeValidator(read_alpha)]
+
+
 class SelfSupervisionSpec(Frozen):
     """What Eq. 3 adds to the game: tau_alpha, for the discriminator and for the actor-critic (3.1.1, 3.1.3)."""
 
-    alpha_low: Finite
-    alpha_high: Finite
+    alpha: AlphaDensity  # what alpha is drawn from: [low, high], or [[low, high, weight], ...]
     pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
     actor_pairing: Pairing  # the same in the actor-critic's batches
     actor_share: Fraction  # share of tau_alpha in an actor-critic batch; the rest is tau_G
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        if self.alpha_low > self.alpha_high:
-            raise ValueError(f"alpha_low {self.alpha_low:g} is above alpha_high {self.alpha_high:g}; swap them")
-        return self
+    @property
+    def alpha_pieces(self) -> tuple[AlphaPiece, ...]:
+        """(low, high, weight) of each range that alpha is drawn from."""
+        density: Any = self.alpha
+        return density if isinstance(density[0], tuple) else ((*density, 1.0),)
 
 
 class WassersteinSpec(Frozen):

@@ -104,7 +104,7 @@ def test_without_a_command_the_help_is_shown(cli: CommandLine) -> None:
         ("train --profile quik", "unknown profile 'quik'; did you mean quick?"),
         ("train --set sac.gama=1", "unknown key 'sac.gama' in --set; did you mean sac.gamma?"),
         ("train --set curriculum.beta=-1", "curriculum.beta = -1 in --set should be greater than or equal to 0."),
-        ("train --set self_supervision.alpha_low=2", "alpha_low 2 is above alpha_high 1; swap them."),
+        ("train --set self_supervision.alpha=[2,1]", "the range from 2 to 1 ends before it begins; swap them."),
         ("train --db /proc/no/such/place.db", "/proc/no"),
         ("runs", "missing command."),
         ("runs lst", "no such command 'lst'. Did you mean 'list'?"),

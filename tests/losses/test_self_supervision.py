@@ -48,7 +48,7 @@ def test_the_network_learns_the_field(printed_formula: bool) -> None:
 
     for _ in range(600):
         optimizer.zero_grad()
-        loss_of(d, sample_alpha(64, -1, 1, draw), printed_formula).backward()
+        loss_of(d, sample_alpha(64, [(-1, 1, 1)], draw), printed_formula).backward()
         optimizer.step()
     line = torch.linspace(-1, 1, 21)
     with torch.no_grad():
@@ -58,9 +58,22 @@ def test_the_network_learns_the_field(printed_formula: bool) -> None:
 
 @given(low=st.floats(-2, 2), width=st.floats(0, 3), seed=st.integers(0, 99))
 def test_alpha_stays_in_its_range(low: float, width: float, seed: int) -> None:
-    alpha = sample_alpha(64, low, low + width, torch.Generator().manual_seed(seed))
+    alpha = sample_alpha(64, [(low, low + width, 1)], torch.Generator().manual_seed(seed))
     assert alpha.shape == (64,)
     assert bool(((alpha >= low - 1e-5) & (alpha <= low + width + 1e-5)).all())
+
+
+def test_weighted_ranges_have_their_share_and_are_uniform_inside() -> None:
+    """Three quarters of the draws in [1, 1.5], the rest in [-1, 0]; nothing between. Equal weights are the control."""
+    draw = torch.Generator().manual_seed(0)
+    for weight, share in ((3.0, 0.75), (1.0, 0.5)):
+        alpha = sample_alpha(40_000, [(-1, 0, 1), (1, 1.5, weight)], draw)
+        upper = alpha[alpha >= 1]
+        assert abs(len(upper) / len(alpha) - share) < 0.01
+        assert bool((alpha[alpha < 1] <= 0).all())
+        assert float(upper.min()) < 1.01 < 1.49 < float(upper.max()) <= 1.5
+        assert abs(float(upper.mean()) - 1.25) < 0.01
+        assert abs(float(upper.std()) - 0.5 / 12**0.5) < 0.005
 
 
 def test_one_alpha_for_all_agents_and_steps() -> None:

@@ -45,7 +45,7 @@ def test_only_states_and_actions_are_blurred() -> None:
 
 
 def test_tau_alpha_lies_between_its_pair() -> None:
-    made, loop = learner("self_supervision.alpha_low=0.5", "self_supervision.alpha_high=0.5")
+    made, loop = learner("self_supervision.alpha=[0.5,0.5]")
     generated, _ = made.generate(0.0)
     mixed, alpha = made._mixed(generated, used(made.supervision), "start")
     assert alpha.tolist() == [0.5] * len(generated)

@@ -5,14 +5,26 @@ D(tau_E) = 1. Here, as in the rest of its text, alpha = 0 is the generated traje
 tau_alpha = (1 - alpha) * tau_G + alpha * tau_E (docs/paper.md).
 """
 
+from collections.abc import Sequence
+
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
-def sample_alpha(batch: int, low: float, high: float, generator: torch.Generator) -> Tensor:
-    """(B,) uniform draws from [low, high]: one alpha for all agents and steps of a trajectory."""
-    return low + (high - low) * torch.rand(batch, generator=generator)
+def sample_alpha(batch: int, pieces: Sequence[tuple[float, float, float]], generator: torch.Generator) -> Tensor:
+    """(B,) draws: one alpha for all agents and steps of a trajectory.
+
+    pieces: (low, high, weight) of the ranges, each drawn from with a probability in proportion to its weight, and
+    uniform inside. The inverse of the distribution function, so that each alpha costs one number of the generator.
+    """
+    low, high, weight = torch.tensor(pieces).unbind(dim=1)
+    upto = (weight / weight.sum()).cumsum(dim=0)
+    uniform = torch.rand(batch, generator=generator)
+    piece = torch.searchsorted(upto[:-1], uniform, right=True)
+    before = (upto - weight / weight.sum())[piece]
+    fraction = (uniform - before) * weight.sum() / weight[piece]
+    return low[piece] + (high - low)[piece] * fraction.clamp(0, 1)
 
 
 def mix(generated: Tensor, expert: Tensor, alpha: Tensor) -> Tensor:

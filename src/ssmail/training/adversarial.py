@@ -180,8 +180,7 @@ class AdversarialLearner:
 
     def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
         """tau_alpha and its alphas for a batch of tau_G."""
-        low, high = supervision.alpha_low, supervision.alpha_high
-        alpha = sample_alpha(len(generated), low, high, self.generators["alpha"]).to(self.device)
+        alpha = sample_alpha(len(generated), supervision.alpha_pieces, self.generators["alpha"]).to(self.device)
         expert = self._pair(generated, pairing)
         states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
         return Batch(states, actions, generated.source), alpha
