@@ -24,13 +24,14 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.figures import style
 from ssmail.figures.ablation_selection import select_ablation
+from ssmail.figures.constant_velocity import constant_velocity
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.selection import SETTLED, Group
 from ssmail.store import Store
 from ssmail.store.comparison import latest_values
 
 NAME = "fig6"
-ERROR, BALANCE, REFERENCE = "test/mode_mse", "test/lane_balance", "test_constant_velocity/mode_mse"
+ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
 SPREAD = 0.17  # of the distance between two values of beta: how far the points of one stand apart
 ASIDE = 0.26  # how far right of them their centre stands
 
@@ -99,13 +100,12 @@ def collect(
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
     selection = select_ablation(store, NAME, runs, profile)
-    values = latest_values(store, selection.runs, [ERROR, BALANCE, REFERENCE])
-    references = [value for (_, name), value in values.items() if name == REFERENCE]
+    values = latest_values(store, selection.runs, [ERROR, BALANCE])
     columns = tuple(_column(group, values, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,
         statistic=statistic,
-        constant_velocity=float(np.median(references)) if references else None,
+        constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
         notes=(*selection.notes, *_notes(columns)),
     )
