@@ -130,10 +130,6 @@ def draw(record: StabilityRecord) -> Figure:
             handles.append(reference)
         style.epoch_axis(panels[-1])
         figure.supylabel("training error, mode_mse (squared scaled units)", fontsize=8)
-        figure.legend(
-            handles=handles,
-            loc="outside upper center",
-            ncols=2,
-            title=f"line and band: {record.statistic.words}; thin: single runs",
-        )
+        title = curves.legend_title(record.statistic)
+        figure.legend(handles=handles, loc="outside upper center", ncols=2, title=title)
         return figure

@@ -188,7 +188,7 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
             top = np.full(column.diverged, axes.get_ylim()[1])
             style.draw_cross(axes, x[~finite], top, CROSSES).set_gid(f"diverged-{column.label}")
     lowest = np.array([column.error.min() for column in record.columns])
-    summary = Summary(*(np.array(part) for part in zip(*(c.error_summary for c in record.columns), strict=True)))
+    summary = _over_columns([column.error_summary for column in record.columns])
     line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
     line.set_label(record.statistic.words)
     handles = [Line2D([], [], color=POINTS, marker=".", ls="", ms=5, mew=0, label="one run"), line]
@@ -203,9 +203,12 @@ def _draw_balances(axes: Axes, record: BetaRecord) -> None:
     for index, column in enumerate(record.columns):
         x = _places(index, len(column.balance))
         axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
-    _draw_centres(
-        axes, Summary(*(np.array(part) for part in zip(*(c.balance_summary for c in record.columns), strict=True)))
-    )
+    _draw_centres(axes, _over_columns([column.balance_summary for column in record.columns]))
+
+
+def _over_columns(summaries: Sequence[Summary]) -> Summary:
+    """Numbers for each of C columns -> three times (C,)."""
+    return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:
