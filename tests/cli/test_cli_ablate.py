@@ -82,25 +82,6 @@ def test_an_ablation_of_ones_own(cli: CommandLine, tmp_path: Path, db: Path, mon
     assert [row["hidden"] for row in outcome.rows] == ["4", "8"]
 
 
-@pytest.mark.parametrize(
-    ("ends", "code", "words"),
-    [
-        ({}, 0, "finished"),
-        ({1: "failed"}, 3, "beta 0.5, seed 1 failed: the reason"),
-        ({0: "diverged"}, 3, "beta 0.5, seed 0 diverged: the reason"),
-        ({0: "failed", 1: "interrupted"}, 130, "the same command continues"),
-    ],
-)
-def test_exit_codes(
-    cli: CommandLine, fake: FakeTraining, db: Path, ends: dict[int, str], code: int, words: str
-) -> None:
-    fake(ends)
-    outcome = cli(*SMOKE, "--values", "0.5", "--seeds", "0-1", "--db", db)
-    assert outcome.code == code
-    assert words in outcome.err.splitlines()[-1]
-    assert len(outcome.rows) == 2
-
-
 def test_progress_says_which_value_and_which_seed(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
     few = cli(*SMOKE, "--values", "0.1,0.2", "--seeds", "0-1", "--db", db).err.splitlines()

@@ -110,26 +110,6 @@ def test_no_color_is_respected(cli: CommandLine, fake: FakeTraining, db: Path, m
     assert not colour.search(cli(*SMOKE, "--db", db).err)
 
 
-@pytest.mark.parametrize(
-    ("ends", "code", "words"),
-    [
-        ({}, 0, ""),
-        ({1: "failed"}, 3, "seed 1 failed: the reason"),
-        ({0: "diverged"}, 3, "seed 0 diverged: the reason"),
-        ({1: "interrupted"}, 130, "the same command continues"),
-        ({0: "failed", 1: "interrupted"}, 130, "the same command continues"),
-    ],
-)
-def test_exit_codes(
-    cli: CommandLine, fake: FakeTraining, db: Path, ends: dict[int, str], code: int, words: str
-) -> None:
-    fake(ends)
-    outcome = cli(*SMOKE, "--seeds", "0-1", "--db", db)
-    assert outcome.code == code
-    assert words in outcome.err.splitlines()[-1]
-    assert len(outcome.out.splitlines()) == 3  # the results that there are are shown all the same
-
-
 def test_a_diverged_run_is_skipped_but_is_no_success(
     cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
