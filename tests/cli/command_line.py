@@ -1,5 +1,7 @@
 """The types of the fixtures."""
 
+import csv
+import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +17,17 @@ class Outcome:
 
     @property
     def sentence(self) -> str:
-        """The complaint of a command that failed: the only line on stderr, without the program's name."""
-        assert self.code != 0
+        """The complaint of a command that refused (exit code 2): the only line on stderr, less the program's name."""
+        assert self.code == 2
         assert self.out == ""
         (line,) = self.err.splitlines()
         assert line.startswith("ssmail: ")
         return line.removeprefix("ssmail: ")
+
+    @property
+    def rows(self) -> list[dict[str, str]]:
+        """The CSV on stdout."""
+        return list(csv.DictReader(io.StringIO(self.out)))
 
 
 CommandLine = Callable[..., Outcome]

@@ -1,7 +1,5 @@
 """`ssmail reproduce`: what it plans, how it counts, what it draws, and how it ends."""
 
-import csv
-import io
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +19,7 @@ SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
 def plan(outcome: Outcome) -> dict[str, tuple[int, int, int]]:
     """(runs, stored, new) by figure."""
     assert outcome.code == 0
-    found = {row["figure"]: row for row in csv.DictReader(io.StringIO(outcome.out))}
+    found = {row["figure"]: row for row in outcome.rows}
     return {name: (int(row["runs"]), int(row["stored"]), int(row["new"])) for name, row in found.items()}
 
 

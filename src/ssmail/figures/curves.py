@@ -195,6 +195,11 @@ def count_label(shown: Band) -> str:
     return f"{shown.label}: {count} run{'s' * (count != 1)}{fate}"
 
 
+def legend_title(statistic: Statistic) -> str:
+    """What the thick line, the band and the thin lines of `draw_band` are."""
+    return f"line and band: {statistic.words}; thin: single runs"
+
+
 def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = np.inf) -> tuple[float, float]:
     """A logarithmic range for every value of the runs and of `others`; see style.log_limits."""
     return style.log_limits(np.concatenate([*(shown.finite for shown in bands), np.array(others)]), ceiling)

@@ -99,7 +99,7 @@ def draw(record: CurriculaRecord) -> Figure:
             (line,) = axes.plot(curve.epochs, curve.values, color=style.REFERENCE, lw=0.8, ls=DASHES, zorder=4)
             line.set_gid(f"closed-form-{shown.label}")
         handles.append(Line2D([], [], color=style.REFERENCE, lw=0.8, ls=DASHES, label="expected, T / (1 + (T - 1) f)"))
-        title = f"line and band: {record.statistic.words}; thin: single runs"
+        title = curves.legend_title(record.statistic)
         figure.legend(handles=handles, loc="outside upper center", ncols=1, title=title)
         return figure
 

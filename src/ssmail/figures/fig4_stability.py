@@ -23,6 +23,7 @@ from ssmail.errors import InputError
 from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import LARGEST, Statistic, permutation_test
 from ssmail.figures import curves, style
+from ssmail.figures.constant_velocity import constant_velocity
 from ssmail.figures.curves import Band, band, silent
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.selection import select
@@ -30,7 +31,6 @@ from ssmail.store import Store
 
 NAME = "fig4"
 METRIC = "train/mode_mse"
-REFERENCE = "test_constant_velocity/mode_mse"
 CEILING = DIVERGED**2  # squared scaled units
 
 
@@ -67,17 +67,15 @@ def collect(
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without training errors.
     """
     selection = select(store, NAME, runs, profile)
-    metrics = store.metrics([run.id for run in selection.runs], names=[METRIC, REFERENCE])
-    errors = metrics[metrics["name"] == METRIC]
+    errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
     for group in selection.groups:
         for run in silent(group, errors):
             raise InputError(f"run {run.name} ({run.state}) has no {METRIC} yet; leave it out or train it further.")
-    reference = metrics.loc[metrics["name"] == REFERENCE, "value"]
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
     return StabilityRecord(
         bands=bands,
         statistic=statistic,
-        constant_velocity=float(reference.median()) if len(reference) else None,
+        constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
         notes=(*selection.notes, *_high_notes(bands), *curves.cut_note(bands), *_comparisons(bands)),
     )
@@ -132,10 +130,6 @@ def draw(record: StabilityRecord) -> Figure:
             handles.append(reference)
         style.epoch_axis(panels[-1])
         figure.supylabel("training error, mode_mse (squared scaled units)", fontsize=8)
-        figure.legend(
-            handles=handles,
-            loc="outside upper center",
-            ncols=2,
-            title=f"line and band: {record.statistic.words}; thin: single runs",
-        )
+        title = curves.legend_title(record.statistic)
+        figure.legend(handles=handles, loc="outside upper center", ncols=2, title=title)
         return figure

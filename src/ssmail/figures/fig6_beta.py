@@ -24,13 +24,14 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.figures import style
 from ssmail.figures.ablation_selection import select_ablation
+from ssmail.figures.constant_velocity import constant_velocity
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.selection import SETTLED, Group
 from ssmail.store import Store
 from ssmail.store.comparison import latest_values
 
 NAME = "fig6"
-ERROR, BALANCE, REFERENCE = "test/mode_mse", "test/lane_balance", "test_constant_velocity/mode_mse"
+ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
 SPREAD = 0.17  # of the distance between two values of beta: how far the points of one stand apart
 ASIDE = 0.26  # how far right of them their centre stands
 
@@ -99,13 +100,12 @@ def collect(
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
     selection = select_ablation(store, NAME, runs, profile)
-    values = latest_values(store, selection.runs, [ERROR, BALANCE, REFERENCE])
-    references = [value for (_, name), value in values.items() if name == REFERENCE]
+    values = latest_values(store, selection.runs, [ERROR, BALANCE])
     columns = tuple(_column(group, values, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,
         statistic=statistic,
-        constant_velocity=float(np.median(references)) if references else None,
+        constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
         notes=(*selection.notes, *_notes(columns)),
     )
@@ -188,7 +188,7 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
             top = np.full(column.diverged, axes.get_ylim()[1])
             style.draw_cross(axes, x[~finite], top, CROSSES).set_gid(f"diverged-{column.label}")
     lowest = np.array([column.error.min() for column in record.columns])
-    summary = Summary(*(np.array(part) for part in zip(*(c.error_summary for c in record.columns), strict=True)))
+    summary = _over_columns([column.error_summary for column in record.columns])
     line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
     line.set_label(record.statistic.words)
     handles = [Line2D([], [], color=POINTS, marker=".", ls="", ms=5, mew=0, label="one run"), line]
@@ -203,9 +203,12 @@ def _draw_balances(axes: Axes, record: BetaRecord) -> None:
     for index, column in enumerate(record.columns):
         x = _places(index, len(column.balance))
         axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
-    _draw_centres(
-        axes, Summary(*(np.array(part) for part in zip(*(c.balance_summary for c in record.columns), strict=True)))
-    )
+    _draw_centres(axes, _over_columns([column.balance_summary for column in record.columns]))
+
+
+def _over_columns(summaries: Sequence[Summary]) -> Summary:
+    """Numbers for each of C columns -> three times (C,)."""
+    return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:

@@ -199,7 +199,7 @@ def draw(record: TrainingRecord) -> Figure:
         for axes, panel in zip(grid, record.panels, strict=True):
             handles |= _draw_panel(axes, panel, strokes)
         style.epoch_axis(grid[-1])
-        title = f"line and band: {record.statistic.words}; thin: single runs"
+        title = curves.legend_title(record.statistic)
         many = len(labels) > 4 and max(len(str(handles[name].get_label())) for name in labels) <= HALF
         figure.legend(
             handles=[handles[name] for name in labels],
