@@ -12,6 +12,7 @@ from ssmail_cli.options import Json
 if TYPE_CHECKING:
     from ssmail.data.trajectories import ExpertSet
 
+DEFAULT_CACHE = "data/cmu"
 SPLITS = ("train", "validation", "test")
 
 
@@ -23,7 +24,10 @@ def prep_mocap(
     download: Annotated[
         bool, typer.Option("--download", help="Fetch the files from the CMU site instead, slowly, into --cache.")
     ] = False,
-    cache: Annotated[Path, typer.Option("--cache", help="Where downloaded files are kept.")] = Path("data/cmu"),
+    cache: Annotated[
+        Path | None,
+        typer.Option("--cache", help="With --download: where its files are kept.", show_default=DEFAULT_CACHE),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/mocap.npz"),
     subject: Annotated[int, typer.Option("--subject", min=1, max=999, help="Number of the subject.")] = 35,
     train: Annotated[str, typer.Option("--train", help="Trials to train on, as 01-12 or 1-3,7.")] = "01-12",
@@ -49,6 +53,8 @@ def prep_mocap(
         validation=parse_trials(validation, "--validation"),
         test=parse_trials(test, "--test"),
     )
+    if cache is not None and not download:
+        raise InputError("--cache belongs to --download; leave --cache out, or let --download fetch the files into it")
     if (source is None) == (not download):
         raise InputError("give either --source with a folder or zip file of the CMU files, or --download")
     expert_file.check_target(out, force=force)
@@ -56,7 +62,7 @@ def prep_mocap(
         from ssmail.data.mocap.download import fetch
 
         trials = (*wanted.train, *wanted.validation, *wanted.test)
-        source = fetch(subject, trials, cache, allow_missing=allow_missing)
+        source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing)
     experts = prepare(source, wanted, allow_missing=allow_missing)
     expert_file.save(experts, out, force=force)
     _tell(experts, out, as_json)

@@ -8,6 +8,7 @@ import typer
 
 from ssmail.errors import InputError
 from ssmail_cli.display import note
+from ssmail_cli.figure_options import DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 
 if TYPE_CHECKING:
@@ -17,15 +18,9 @@ if TYPE_CHECKING:
     from ssmail.figures import FigureRecord
     from ssmail.store import RunRow, Store
 
-TRAINING, SKELETON = "training", "skeleton"
+SKELETON = "skeleton"
 DEFAULT_METRIC, DEFAULT_GROUPS = "train/mode_mse", "method"
 DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
-
-OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
-Formats = Annotated[
-    list[str] | None,
-    typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
-]
 
 
 def plot(
@@ -36,7 +31,7 @@ def plot(
             help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), training, skeleton.",
         ),
     ],
-    out: OutDir = Path("results/figures"),
+    out: OutDir = DEFAULT_OUT,
     formats: Formats = None,
     runs: Annotated[
         list[str] | None,
@@ -96,14 +91,15 @@ def plot(
     from ssmail.figures import FIGURES
 
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
-    _check(figures, formats or [])
+    _check_figures(figures)
+    check_formats(formats or [])
     training = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
     skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
     _check_owner(TRAINING, training, figures)
     _check_owner(SKELETON, skeleton, figures)
     if ids and profile and figures != [TRAINING]:
         raise InputError("--runs names the runs already; leave --profile out.")
-    statistic = _statistic(stat, figures)
+    statistic = parse_statistic(stat, figures)
     names = dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures)
     if set(names) == {SKELETON} and (ids or profile):
         raise InputError(f"{SKELETON} shows no runs; leave {'--runs' if ids else '--profile'} out.")
@@ -119,18 +115,14 @@ def plot(
             _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)
 
 
-def _check(figures: Sequence[str], formats: Sequence[str]) -> None:
+def _check_figures(figures: Sequence[str]) -> None:
     """Refuse unknown names."""
     from ssmail.experiments import unknown_name
     from ssmail.figures import FIGURES
-    from ssmail.figures.provenance import FORMATS
 
     for name in figures:
         if name not in FIGURES and name not in (TRAINING, SKELETON):
             raise unknown_name("figure", name, [*FIGURES, TRAINING, SKELETON])
-    for form in formats:
-        if form not in FORMATS:
-            raise unknown_name("figure format", form, FORMATS)
 
 
 def _check_owner(owner: str, options: Mapping[str, object], figures: Sequence[str]) -> None:
@@ -139,20 +131,6 @@ def _check_owner(owner: str, options: Mapping[str, object], figures: Sequence[st
     others = [name for name in figures if name != owner]
     if given and others:
         raise InputError(f"{given[0]} belongs to `ssmail plot {owner}`; draw {', '.join(others)} without it.")
-
-
-def _statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
-    from ssmail.evaluation.statistics import Statistic
-    from ssmail.experiments import unknown_name
-    from ssmail.figures import FIGURES
-
-    if stat is None:
-        return None
-    if stat not in list(Statistic):
-        raise unknown_name("statistic", stat, list(Statistic))
-    if not any(name == TRAINING or (name in FIGURES and FIGURES[name].has_statistic) for name in figures):
-        raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
-    return Statistic(stat)
 
 
 def _chosen(

@@ -10,12 +10,14 @@ import typer
 from ssmail.errors import InputError
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
+from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
 from ssmail_cli.progress import Sweep
 from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows
 from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
 
 if TYPE_CHECKING:
+    from ssmail.evaluation.statistics import Statistic
     from ssmail.execution.local import Cell
     from ssmail.spec import RunSpec
     from ssmail.store import Store
@@ -37,12 +39,15 @@ def reproduce(
         bool, typer.Option("--dry-run", help="Print how many runs there are to train and how long that may take.")
     ] = False,
     as_json: Json = False,
-    out: Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")] = Path(
-        "results/figures"
-    ),
-    formats: Annotated[
-        list[str] | None,
-        typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = None,
+    stat: Annotated[
+        str | None,
+        typer.Option(
+            "--stat",
+            help="Centre and band of fig3, fig4 and fig6: mean-std, median-iqr or mean-ci.",
+            show_default="mean-std",
+        ),
     ] = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
@@ -54,9 +59,10 @@ def reproduce(
     from ssmail.execution.figure_cells import longest_first
     from ssmail.store import Store
 
-    _check_formats(formats or [])
+    check_formats(formats or [])
     chosen_seeds = parse_seeds(seeds)
     figures = _figures(only, profile, chosen_seeds)
+    statistic = parse_statistic(stat, list(figures))
     needed = _merged(figures.values())
     seconds = _seconds(needed, db)
     if dry_run:
@@ -66,19 +72,10 @@ def reproduce(
     chosen_device = pick_device(device)
     store = Store.open(db)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, ResumeChoice.AUTO, chosen_device))
-    drawn = is_interrupted(rows) or _draw(store, figures, sweep, rows, out, formats or ["png"])
+    drawn = is_interrupted(rows) or _draw(store, figures, sweep, rows, statistic, out, formats or ["png"])
     finish(sweep, rows)
     if not drawn:
         raise typer.Exit(FAILURE)
-
-
-def _check_formats(formats: Sequence[str]) -> None:
-    from ssmail.experiments import unknown_name
-    from ssmail.figures.provenance import FORMATS
-
-    for form in formats:
-        if form not in FORMATS:
-            raise unknown_name("figure format", form, FORMATS)
 
 
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
@@ -148,7 +145,13 @@ def duration(seconds: float) -> str:
 
 
 def _draw(
-    store: "Store", figures: dict[str, Sweep], sweep: Sweep, rows: Rows, out: Path, formats: Sequence[str]
+    store: "Store",
+    figures: dict[str, Sweep],
+    sweep: Sweep,
+    rows: Rows,
+    statistic: "Statistic | None",
+    out: Path,
+    formats: Sequence[str],
 ) -> bool:
     """Save each figure from its own runs, as far as they ended, and print the paths; whether all could be drawn."""
     from ssmail.figures import FIGURES, save
@@ -157,7 +160,7 @@ def _draw(
     complete = True
     for name, cells in figures.items():
         try:
-            record = FIGURES[name].collect(store, _ids(name, cells, ended))
+            record = FIGURES[name].collect(store, _ids(name, cells, ended), statistic=statistic)
             for remark in record.notes:
                 note(f"{name}: {remark}")
             for path in save(name, record, FIGURES[name].draw(record), out, formats):

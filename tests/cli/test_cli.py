@@ -122,6 +122,8 @@ def test_without_a_command_the_help_is_shown(cli: CommandLine) -> None:
         ("ablate curriculum --values forcing", "curriculum.name = forcing in --values should be 'none'"),
         ("reproduce --only fig4,fig55", "unknown figure 'fig55'; did you mean fig5?"),
         ("reproduce --format jpg", "unknown figure format 'jpg'; did you mean png?"),
+        ("reproduce --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
+        ("reproduce --only fig5,fig9 --stat mean-ci", "fig5, fig9 shows no centre and band; leave --stat out."),
         ("reproduce --profile quik", "unknown profile 'quik'; did you mean quick?"),
         ("reproduce --seeds 4-0", "the range 4-0 in --seeds runs backwards"),
         ("plot", "missing argument 'FIGURE...'."),

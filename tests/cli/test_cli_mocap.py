@@ -103,6 +103,8 @@ def test_a_broken_file(cli: CommandLine, folder: Path, tmp_path: Path, fault: st
     [
         ("", "give either --source with a folder or zip file of the CMU files, or --download"),
         ("--source . --download", "give either --source"),
+        ("--source . --cache c", "--cache belongs to --download; leave --cache out, or let --download fetch the files"),
+        ("--cache c", "--cache belongs to --download"),
         ("--source absent", "there is no absent; --source takes a folder or a zip file"),
         ("--source . --subject 35", "holds no 35.asf, the skeleton of subject 35; add it"),
         ("--source . --subject 0", "'--subject'"),
@@ -153,11 +155,12 @@ def prepared_hash(cli: CommandLine, folder: Path, tmp_path: Path) -> str:
 
 
 def test_a_download_that_fails(cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fetch(*_: Any, **__: Any) -> Path:
-        raise InputError("there is no such file")
+    def fetch(subject: int, trials: Any, cache: Path, **_: Any) -> Path:
+        raise InputError(f"there is no such file in {cache}")
 
     monkeypatch.setattr(download, "fetch", fetch)
-    assert cli("prep-mocap", "--download", "--out", tmp_path / "set.npz").sentence == "there is no such file"
+    sentence = cli("prep-mocap", "--download", "--out", tmp_path / "set.npz").sentence
+    assert sentence == "there is no such file in data/cmu"
     assert not list(tmp_path.iterdir())
 
 

@@ -92,6 +92,25 @@ def test_figures_are_drawn_from_their_runs_alone(
     assert outcome.err.startswith("ssail, seed 0: started (run ")
 
 
+def test_a_statistic_can_be_chosen_for_the_figures_that_have_one(
+    cli: CommandLine, fake: FakeTraining, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs(monkeypatch, tmp_path, fig4=["ssail"], fig9=["ssail"])
+    fake()
+    options = ("--out", tmp_path / "figures", "--db", db)
+    table = tmp_path / "figures" / "fig4_stability.csv"
+    assert cli(*SMOKE, "--stat", "median-iqr", *options).code == 0
+    assert ("\nmedian," in table.read_text(), "\nmean," in table.read_text()) == (True, False)
+    assert cli(*SMOKE, *options).code == 0
+    assert ("\nmedian," in table.read_text(), "\nmean," in table.read_text()) == (False, True)
+
+
+def test_the_help_names_every_figure_with_a_statistic(cli: CommandLine) -> None:
+    names = [name for name in dict.fromkeys(m.name for m in FIGURES.values()) if FIGURES[name].has_statistic]
+    shown = " ".join(cli("reproduce", "--help").out.split())
+    assert f"Centre and band of {', '.join(names[:-1])} and {names[-1]}:" in shown
+
+
 @pytest.mark.parametrize(
     ("ends", "code", "drawn", "words"),
     [

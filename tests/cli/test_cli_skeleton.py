@@ -37,6 +37,16 @@ def test_a_film_of_another_split(cli: CommandLine, data: Path, tmp_path: Path, m
     assert all((tmp_path / "figures" / name).stat().st_size for name in names)
 
 
+def test_a_set_without_a_skeleton_is_refused_with_what_makes_one(cli: CommandLine, tmp_path: Path) -> None:
+    lanes = tmp_path / "lanes.npz"
+    assert cli("generate-yjunction", "--train", 2, "--validation", 2, "--test", 2, "--out", lanes).code == 0
+    assert cli("plot", "skeleton", "--data", lanes, "--out", tmp_path / "figures").sentence == (
+        f"{lanes} holds an expert set of yjunction, which has no skeleton; make a set of recorded walking with "
+        "`ssmail prep-mocap` and name its file with --data."
+    )
+    assert not (tmp_path / "figures").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

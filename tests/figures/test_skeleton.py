@@ -151,8 +151,11 @@ def test_what_cannot_be_drawn_is_said(data: Path, tmp_path: Path) -> None:
         skeleton.collect(tmp_path / "absent.npz")
     lanes = YJunctionSpec(train=2, validation=2, test=2, agents=2, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
     expert_file.save(yjunction.generate(lanes), tmp_path / "lanes.npz")
-    with pytest.raises(InputError, match=r"lanes\.npz is an expert set of yjunction, not of mocap"):
+    with pytest.raises(InputError, match=r"lanes\.npz holds an expert set of yjunction, which .*prep-mocap"):
         skeleton.collect(tmp_path / "lanes.npz")
+    (tmp_path / "broken.npz").write_bytes(data.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"broken\.npz is truncated .*prep-mocap"):
+        skeleton.collect(tmp_path / "broken.npz")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"file cannot be written: .*; choose another folder\.$"):
         skeleton.save_film(skeleton.collect(data), tmp_path / "file" / "walk.gif")

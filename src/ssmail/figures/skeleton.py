@@ -22,7 +22,7 @@ from PIL import Image
 
 from ssmail.data import expert_file
 from ssmail.data.mocap.dataset import SPLITS
-from ssmail.data.trajectories import Trajectories
+from ssmail.data.trajectories import ExpertSet, Trajectories
 from ssmail.errors import InputError
 from ssmail.experiments import unknown_name
 from ssmail.figures import style
@@ -94,7 +94,7 @@ def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
     """
     if split not in SPLITS:
         raise unknown_name("split", split, SPLITS)
-    experts = expert_file.load(path, "mocap")
+    experts = _recorded(path)
     windows: Trajectories = getattr(experts, split)
     if not 0 <= window < len(windows):
         raise InputError(f"{path} has {len(windows)} {split} windows, 0 to {len(windows) - 1}, so no window {window}.")
@@ -113,6 +113,23 @@ def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
         first_frame=first,
         provenance=Provenance.of_data(NAME, experts.hash),
         notes=(f"{split} window {window} of 0-{len(windows) - 1}: trial {trial} from frame {first} on.",),
+    )
+
+
+def _recorded(path: Path) -> ExpertSet:
+    """The set in the file. A set of another environment is refused with what makes a fitting one, because what
+    `expert_file.load` says of it is how to train on it.
+    """
+    try:
+        return expert_file.load(path, "mocap")
+    except InputError as refused:
+        try:
+            other = expert_file.load(path).environment
+        except InputError:
+            raise refused from None
+    raise InputError(
+        f"{path} holds an expert set of {other}, which has no skeleton; make a set of recorded walking with "
+        "`ssmail prep-mocap` and name its file with --data."
     )
 
 
