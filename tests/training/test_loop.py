@@ -8,6 +8,7 @@ import torch
 from ssmail.experiments import build_spec
 from ssmail.spec import METHODS, RunSpec
 from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.curricula import mean_segment_length
 from ssmail.training.loop import Divergence, TrainingLoop
 
 LEARNING = [method for method in METHODS if build_spec(method, "yjunction", "smoke").epochs]
@@ -80,11 +81,11 @@ def test_the_alpha_range_leaves_weights_and_data_order_alone(spec: RunSpec) -> N
 def test_complete_forcing_keeps_the_expert_states(spec: RunSpec) -> None:
     learner = adversarial(TrainingLoop(spec, 0))
     experts, steps = learner.experts, learner.setting.steps
-    batch, segment = learner.generate(1.0)
-    assert segment == 1
+    batch, interventions = learner.generate(1.0)
+    assert mean_segment_length(interventions) == 1
     torch.testing.assert_close(batch.states[:, :steps], experts.states[batch.source][:, :steps])
-    free, segment = learner.generate(0.0)
-    assert segment == steps
+    free, interventions = learner.generate(0.0)
+    assert mean_segment_length(interventions) == steps
     assert not torch.allclose(free.states[:, steps - 1], experts.states[free.source][:, steps - 1])
 
 
@@ -137,10 +138,10 @@ def test_the_best_model_uses_every_mode_if_one_does(spec: RunSpec) -> None:
     for loop.epoch, (error, balance) in enumerate(
         [(0.02, 0.0), (0.03, 0.0), (0.05, 0.4), (0.01, 0.1), (0.04, 0.3), (0.06, 0.5)], 1
     ):
-        loop._select(error, balance)
+        loop._select(*loop.evaluator.rank({"validation/mode_mse": error, "validation/lane_balance": balance}))
         kept.append((loop.improved, loop.best_epoch))
     assert kept == [(True, 1), (False, 1), (True, 3), (False, 3), (True, 5), (False, 5)]
-    loop._select(math.nan, 0.5)
+    loop._select(*loop.evaluator.rank({"validation/mode_mse": math.nan, "validation/lane_balance": 0.5}))
     assert not loop.improved
 
 

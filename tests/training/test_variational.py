@@ -54,7 +54,7 @@ def test_a_rollout_of_dnri_follows_its_prior_and_nri_keeps_one_graph(monkeypatch
         calls = []
         sample = type(made.model).sample
         monkeypatch.setattr(type(made.model), "sample", lambda *a, s=sample, c=calls: (c.append(1), s(*a))[1])
-        made.predictor.free_run(made.setting.experts.states[:2, 0], 5, torch.Generator())
+        made.predictor.free_run(made.setting.experts.states[:2, :1], 5, torch.Generator())
         monkeypatch.undo()
         assert len(calls) == drawn
 
@@ -62,7 +62,7 @@ def test_a_rollout_of_dnri_follows_its_prior_and_nri_keeps_one_graph(monkeypatch
 def test_predicting_leaves_the_model_in_training_mode_and_its_statistics_alone() -> None:
     made = learner()
     before = deepcopy(made.model.state_dict())
-    made.predictor.free_run(made.setting.experts.states[:2, 0], 3, torch.Generator())
+    made.predictor.free_run(made.setting.experts.states[:2, :1], 3, torch.Generator())
     made.predictor.one_step(made.setting.experts.states[:2], torch.Generator())
     assert made.model.training
     for name, value in made.model.state_dict().items():
