@@ -1,14 +1,17 @@
+from typing import Any
+
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ssmail.models import message_passing
 from ssmail.models.actor import Actor
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.graph_encoder import GraphEncoder, off_diagonal, on_diagonal
-from ssmail.models.message_passing import EdgeFunction, TypedMessages
+from ssmail.models.message_passing import DENSE_UP_TO, EdgeFunction, SumOverSenders, TypedMessages, sum_over_senders
 from ssmail.spec import ModelSpec
 
 SPEC = ModelSpec(
@@ -131,3 +134,83 @@ def test_off_diagonal_and_back(n: int, h: int) -> None:
     expected = torch.stack([pairs[:, :, i, j] for i in range(n) for j in range(n) if i != j], dim=2)
     torch.testing.assert_close(edges, expected, rtol=0, atol=0)
     torch.testing.assert_close(on_diagonal(edges, n), pairs * (1 - torch.eye(n)).view(n, n, 1), rtol=0, atol=0)
+
+
+def all_pairs(s: Tensor, r: Tensor, w: Tensor) -> Tensor:
+    """sum_i w_ijk relu(s_ik + r_jk), by its formula."""
+    return (torch.relu(s.unsqueeze(-3) + r.unsqueeze(-4)) * w.unsqueeze(-1)).sum(dim=-4)
+
+
+def senders_and_receivers(n: int, seed: int = 0, batch: tuple[int, ...] = (2,)) -> tuple[Tensor, Tensor, Tensor]:
+    """s and r (..., N, K, H), w (..., N, N, K) in float64, for K = 2 and H = 3."""
+    draw = torch.Generator().manual_seed(seed)
+    shapes = ((*batch, n, 2, 3), (*batch, n, 2, 3), (*batch, n, n, 2))
+    s, r, w = (torch.randn(*shape, generator=draw, dtype=torch.float64, requires_grad=True) for shape in shapes)
+    return s, r, w
+
+
+around_the_change = pytest.mark.parametrize("n", [1, 2, DENSE_UP_TO - 1, DENSE_UP_TO, DENSE_UP_TO + 1, DENSE_UP_TO + 4])
+
+
+@around_the_change
+@pytest.mark.parametrize("wanted", [True, False], ids=["w too", "without w"])
+def test_sums_over_senders_equal_the_dense_form_and_so_do_their_gradients(n: int, wanted: bool) -> None:
+    """In both forms, whichever of them is the faster at this N; first derivatives, and those of a function of them."""
+    s, r, w = senders_and_receivers(n)
+    inputs = (s, r, w) if wanted else (s, r)
+    w = w if wanted else w.detach()
+    found = []
+    for form in (all_pairs, sum_over_senders, SumOverSenders.apply):
+        total = form(s, r, w)
+        first = torch.autograd.grad(total.square().sum(), inputs, create_graph=True)
+        second = torch.autograd.grad(sum(g.square().sum() for g in first), inputs)
+        found.append((total, *first, *second))
+    for other in found[1:]:
+        for expected, value in zip(found[0], other, strict=True):
+            torch.testing.assert_close(value, expected)
+
+
+@pytest.mark.parametrize("n", [2, DENSE_UP_TO + 1])
+def test_gradients_of_sums_over_senders_against_differences(n: int) -> None:
+    s, r, w = senders_and_receivers(n, batch=())
+    for form in (sum_over_senders, SumOverSenders.apply):
+        assert torch.autograd.gradcheck(form, (s, r, w), fast_mode=True)
+        assert torch.autograd.gradgradcheck(form, (s, r, w), fast_mode=True)
+        assert torch.autograd.gradcheck(form, (s, r, w.detach()), fast_mode=True)
+        assert torch.autograd.gradgradcheck(form, (s, r, w.detach()), fast_mode=True)
+
+
+def test_the_check_of_gradients_can_fail() -> None:
+    """Negative control: a backward pass that gives ones for the senders."""
+
+    class Wrong(SumOverSenders):
+        @staticmethod
+        def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+            of_s, of_r, of_w = SumOverSenders.backward(ctx, gradient)
+            return torch.ones_like(of_s), of_r, of_w
+
+    assert not torch.autograd.gradcheck(Wrong.apply, senders_and_receivers(3, batch=()), raise_exception=False)
+
+
+@settings(max_examples=30)
+@given(n=st.integers(1, DENSE_UP_TO + 3), batch=st.lists(st.integers(1, 3), max_size=2), seed=st.integers(0, 2**16))
+def test_sums_over_senders_for_any_shape_and_weights_that_are_shared(n: int, batch: list[int], seed: int) -> None:
+    """Leading axes of any number; weights (N, N, K) that all of them share, whose gradient is then summed over them."""
+    s, r, w = senders_and_receivers(n, seed, tuple(batch))
+    shared = w.detach()[(0,) * len(batch)].requires_grad_()
+    for weights in (w, shared):
+        expected, total = (form(s, r, weights) for form in (all_pairs, SumOverSenders.apply))
+        torch.testing.assert_close(total, expected)
+        of_w = [torch.autograd.grad(form.sin().sum(), weights)[0] for form in (expected, total)]
+        torch.testing.assert_close(of_w[1], of_w[0])
+
+
+def test_layers_are_the_same_in_both_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch.manual_seed(0)
+    x, graph = torch.randn(2, 3, DENSE_UP_TO + 2, 4), one_hot_graph(2, 3, DENSE_UP_TO + 2)
+    typed, edges = TypedMessages(4, SPEC), EdgeFunction(4, 6, 5)
+    by_sender = typed(x, graph), edges.messages(x)
+    monkeypatch.setattr(message_passing, "DENSE_UP_TO", 99)
+    monkeypatch.setattr(message_passing, "SumOverSenders", None)  # so that it is not by sender a second time
+    for one, other in zip(by_sender, (typed(x, graph), edges.messages(x)), strict=True):
+        torch.testing.assert_close(one, other)

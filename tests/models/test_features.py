@@ -1,0 +1,86 @@
+"""What networks read of an agent: relative positions, the step, the start, and which agent it is."""
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+
+from ssmail.experiments import build_spec
+from ssmail.models.features import Features
+from ssmail.spec import used
+
+
+def whole(*shape: int, seed: int = 0) -> Tensor:
+    """Random whole numbers, whose sums and differences are exact."""
+    return torch.randint(-50, 50, shape, generator=torch.Generator().manual_seed(seed)).float()
+
+
+def moved(states: Tensor, shift: Tensor) -> Tensor:
+    """The whole group in another place; a shift (P,) of positions."""
+    return states + torch.cat([shift, torch.zeros_like(shift)])
+
+
+@pytest.mark.parametrize("root_relative", [True, False])
+@given(axes=st.integers(1, 3), agents=st.integers(1, 5), seed=st.integers(0, 2**16))
+def test_a_shift_of_the_whole_group_is_not_seen(root_relative: bool, axes: int, agents: int, seed: int) -> None:
+    """Nor in the first state; without root_relative it is."""
+    states, shift = whole(2, 4, agents, 2 * axes, seed=seed), 1 + whole(axes, seed=seed).abs()
+    features = Features(time=True, start=True, steps=4, root_relative=root_relative)
+    here, there = (features(seen, seen[:, 0]) for seen in (states, moved(states, shift)))
+    assert torch.equal(here, there) is root_relative
+
+
+def test_positions_are_relative_to_the_root_by_hand() -> None:
+    """Two agents on a plane, [x, y, vx, vy]: the root's own position is left out, velocities are as they are."""
+    states = torch.tensor([[[[3.0, 4.0, 1.0, 2.0], [5.0, 1.0, -1.0, 0.5]]]])
+    relative = Features(time=False, start=False, steps=9, root_relative=True)(states, states[:, 0])
+    assert relative.tolist() == [[[[0.0, 0.0, 1.0, 2.0], [2.0, -3.0, -1.0, 0.5]]]]
+    assert Features(time=False, start=False, steps=9)(states, states[:, 0]) is states
+
+
+def test_the_first_state_is_relative_to_where_the_root_was_then() -> None:
+    states = torch.tensor([[[[0.0, 1.0], [2.0, 1.0]], [[7.0, 1.0], [9.5, 1.0]]]])
+    x = Features(time=False, start=True, steps=2, root_relative=True)(states, states[:, 0])
+    assert x[0, 1].tolist() == [[0.0, 1.0, 0.0, 1.0], [2.5, 1.0, 2.0, 1.0]]
+
+
+def test_the_step_is_scaled_wherever_a_sequence_is_cut() -> None:
+    """0 .. steps - 1 -> -1 .. 1; the second half of five steps begins at step 3."""
+    states, features = whole(1, 5, 2, 2), Features(time=True, start=False, steps=5)
+    x = features(states, states[:, 0])
+    assert x[0, :, 1, -1].tolist() == [-1, -0.5, 0, 0.5, 1]
+    assert torch.equal(features(states[:, 3:], states[:, 0], 3), x[:, 3:])
+    assert not torch.equal(features(states[:, 3:], states[:, 0]), x[:, 3:])
+
+
+def test_agents_are_told_apart_by_a_one_hot() -> None:
+    """Three agents that are all alike in their state; without the one-hot nothing tells them apart."""
+    states = torch.ones(2, 3, 3, 4)
+    named = Features(time=False, start=False, steps=3, agents=3)(states, states[:, 0])
+    assert torch.equal(named[1, 2, :, 4:], torch.eye(3))
+    plain = Features(time=False, start=False, steps=3)(states, states[:, 0])
+    assert not torch.equal(named[:, :, 0], named[:, :, 1])
+    assert torch.equal(plain[:, :, 0], plain[:, :, 1])
+
+
+@given(
+    time=st.booleans(),
+    start=st.booleans(),
+    relative=st.booleans(),
+    named=st.booleans(),
+    shape=st.tuples(*[st.integers(1, 4)] * 4),
+)
+def test_the_size_is_that_of_the_features(
+    time: bool, start: bool, relative: bool, named: bool, shape: tuple[int, int, int, int]
+) -> None:
+    b, t, n, axes = shape
+    features = Features(time, start, steps=t + 1, root_relative=relative, agents=n * named)
+    states = whole(b, t, n, 2 * axes)
+    assert features(states, states[:, 0]).shape == (b, t, n, features.size(2 * axes))
+
+
+def test_a_spec_says_what_is_read() -> None:
+    yjunction, mocap = (used(build_spec("ssail", name, "smoke").model) for name in ("yjunction", "mocap"))
+    assert Features.of(yjunction, 50, 3) == Features(time=True, start=False, steps=50)
+    assert Features.of(mocap, 50, 31) == Features(time=False, start=False, steps=50, root_relative=True, agents=31)
