@@ -101,3 +101,35 @@ def test_a_little_training_beats_constant_velocity_by_one_step(method: str) -> N
         values, _ = loop.final_evaluation()
         ratio = values["test_last/one_step_mse"] / values["test_constant_velocity/one_step_mse"]
         assert (ratio < 0.92) is learns, ratio
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_dnri_has_read_what_was_observed_as_in_one_pass(noise: float) -> None:
+    """Its prior, and the memory of a recurrent decoder."""
+    made, h, steps = learner("dnri", "variational.decoder=recurrent"), 4, 3
+    observed = made.setting.experts.states[:2, :h]
+    for p in made.model.parameters():
+        p.data += 0.2 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel()))
+    draw = torch.Generator().manual_seed(0)
+    added = noise * torch.randn(2, h + steps - 1, *observed.shape[2:], generator=draw)
+    run = made.predictor.free_run(observed, steps, draw, deterministic=True, noise=added)
+    read = torch.cat([observed[:, :-1], run[:, :-1]], dim=1) + added
+
+    def velocities(states: torch.Tensor) -> torch.Tensor:
+        logits = made.model.past_logits(states)
+        return made.model.decoder(states, made.model.sample(logits, torch.zeros_like(logits)))[0]
+
+    made.model.eval()
+    torch.testing.assert_close(velocities(read)[:, h - 1 :], run[:, 1:, :, 2:])
+    forgetful = velocities(read[:, h - 1 :])  # negative control
+    assert not torch.allclose(forgetful, run[:, 1:, :, 2:], atol=1e-4)
+
+
+def test_nri_infers_its_graph_from_all_that_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
+    made, noise = learner("nri"), torch.randn(2, 8, 3, 4, generator=torch.Generator().manual_seed(0))
+    observed, seen = made.setting.experts.states[:2, :6], []
+    posterior = made.model.past_logits
+    monkeypatch.setattr(made.model, "past_logits", lambda states: (seen.append(states), posterior(states))[1])
+    made.predictor.free_run(observed, 3, torch.Generator(), noise=noise)
+    assert len(seen) == 1
+    assert torch.equal(seen[0], observed + noise[:, :6])
