@@ -56,6 +56,7 @@ def one_step_mse(predicted: Floats, truth: Floats) -> float:
 STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def forecast_metrics(
     predicted: Floats, truth: Floats, scaling: Scaling
 ) -> tuple[dict[str, float], dict[str, np.ndarray]]:
@@ -66,8 +67,7 @@ def forecast_metrics(
     mean and final distance in raw units; diverged the share of predictions with a non-finite or |scaled| > 10 position.
     Arrays: mse (T,), and mse_spread (T,), the standard deviation (n - 1) over windows of their mean over samples.
     """
-    with np.errstate(over="ignore", invalid="ignore"):
-        errors = np.square(predicted - truth).mean(axis=(-2, -1))  # (S, B, T)
+    errors = np.square(predicted - truth).mean(axis=(-2, -1))  # (S, B, T)
     curve, windows = errors.mean(axis=(0, 1)), errors.mean(axis=0)
     axes = truth.shape[-1] // 2
     raw = scaling.unscale_positions(predicted[..., :axes]), scaling.unscale_positions(truth[..., :axes])
