@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
+from ssmail.errors import InputError
 from ssmail.evaluation.protocol import forecast_metrics, full_metrics, one_step_mse, quick_metrics
 from ssmail.spec import RunSpec, used
 from ssmail.training.experts import scaled_batch
@@ -138,7 +139,7 @@ class LaneEvaluator(_Evaluator):
 
 class ForecastEvaluator(_Evaluator):
     """Recorded motion: some frames are observed, the following ones predicted, with and without noise on what is read
-    (section 4.6; the windows are those of DNRI's protocol).
+    (section 4.6; the windows are those of DNRI's protocol). Raises InputError when the test windows are too short.
     """
 
     KEPT = 4  # test windows whose predictions are stored as trajectories
@@ -146,6 +147,7 @@ class ForecastEvaluator(_Evaluator):
     def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
         super().__init__(spec, data, setting)
         self.forecast = used(spec.forecast)
+        self._check_windows()
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """One sampled rollout of each validation window from its first frame, and of some training windows."""
@@ -190,6 +192,15 @@ class ForecastEvaluator(_Evaluator):
         arrays["test/expert"] = self._positions(truth[None])
         return values, arrays
 
+    def _check_windows(self) -> None:
+        observed, predicted = self.forecast.observed, self.forecast.predicted
+        frames = self.data.test.positions.shape[1]
+        if observed + predicted > frames:
+            raise InputError(
+                f"forecast.observed {observed} and forecast.predicted {predicted} need {observed + predicted} frames, "
+                f"but the test windows of the data have {frames}; lower one of the two with --set."
+            )
+
     def _positions(self, states: Floats) -> np.ndarray:
         """Raw positions of the first KEPT windows of (1, B, T, N, D) scaled states."""
         scaled = states[0, : self.KEPT, ..., : states.shape[-1] // 2]
@@ -199,7 +210,8 @@ class ForecastEvaluator(_Evaluator):
     def _predict(self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: bool) -> tuple[Floats, Floats]:
         """(S, B, T', N, D) predictions of the frames after the observed ones, and the truth (B, T', N, D)."""
         h, steps, b = self.forecast.observed, self.forecast.predicted, len(states)
-        samples = 1 if deterministic and predictor is self.reference else self.spec.evaluation.samples
+        always_the_same = isinstance(predictor, (ConstantVelocity, CopyLast)) and not noisy
+        samples = 1 if always_the_same else self.spec.evaluation.samples
         observed = states[:, :h].repeat(samples, 1, 1, 1)
         noise = self._noise(observed, steps) if noisy else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
