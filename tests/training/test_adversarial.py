@@ -118,3 +118,12 @@ def test_clipping_bounds_the_critic_and_the_penalty_does_not() -> None:
         assert ("discriminator/penalty" in values) is not bounded
         largest = max(float(p.detach().abs().max()) for p in made.discriminator.parameters())
         assert (largest <= 0.01) is bounded
+
+
+def test_rewards_are_kept_within_their_limit() -> None:
+    """After scaling; without a limit they leave it."""
+    for limit, within in (("1.0", True), ("null", False)):
+        made, loop = learner("adversarial.reward_scale=1000", f"adversarial.reward_limit={limit}")
+        states, actions = loop.experts.states[:, :-1], loop.experts.actions
+        rewards = made._reward(made.features(states, states[:, 0]), actions)
+        assert (float(rewards.abs().max().detach()) <= 1) is within

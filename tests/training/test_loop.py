@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 import torch
 
+from ssmail.errors import InputError
 from ssmail.experiments import build_spec
 from ssmail.spec import METHODS, RunSpec
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.curricula import mean_segment_length
 from ssmail.training.loop import Divergence, TrainingLoop
+from tests.training.conftest import ToySpec
 
 LEARNING = [method for method in METHODS if build_spec(method, "yjunction", "smoke").epochs]
 
@@ -41,9 +43,8 @@ def test_same_seed_same_numbers_other_seed_other_numbers(spec: RunSpec) -> None:
     assert first != other
 
 
-@pytest.mark.parametrize("method", LEARNING)
-def test_a_resumed_run_equals_an_uninterrupted_one(method: str, tmp_path: Path) -> None:
-    spec = build_spec(method, "yjunction", "smoke", ["training.epochs=4"])
+def check_resumed(spec: RunSpec, state_file: Path) -> None:
+    """That a run of four epochs, saved and resumed after two, equals an uninterrupted one."""
     whole = TrainingLoop(spec, 0)
     expected = epochs(whole, 4)
     expected_test, expected_arrays = whole.final_evaluation()
@@ -51,9 +52,9 @@ def test_a_resumed_run_equals_an_uninterrupted_one(method: str, tmp_path: Path) 
     torch.manual_seed(99)  # nothing may hang on torch's global generator
     broken = TrainingLoop(spec, 0)
     records = epochs(broken, 2)
-    torch.save(broken.state_dict(), tmp_path / "state.pt")
+    torch.save(broken.state_dict(), state_file)
     resumed = TrainingLoop(spec, 0)
-    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    resumed.load_state_dict(torch.load(state_file, weights_only=True))
     records += epochs(resumed, 2)
     assert records == expected
     values, arrays = resumed.final_evaluation()
@@ -62,10 +63,24 @@ def test_a_resumed_run_equals_an_uninterrupted_one(method: str, tmp_path: Path) 
         np.testing.assert_array_equal(arrays[name], expected_arrays[name])
 
     forgetful = TrainingLoop(spec, 0)  # negative control: a state without the generators is not enough
-    state = torch.load(tmp_path / "state.pt", weights_only=True)
+    state = torch.load(state_file, weights_only=True)
     state["generators"] = forgetful.generators.state_dict()
     forgetful.load_state_dict(state)
     assert epochs(forgetful, 2) != expected[2:]
+
+
+@pytest.mark.parametrize("method", LEARNING)
+def test_a_resumed_run_equals_an_uninterrupted_one(method: str, tmp_path: Path) -> None:
+    check_resumed(build_spec(method, "yjunction", "smoke", ["training.epochs=4"]), tmp_path / "state.pt")
+
+
+@pytest.mark.parametrize(
+    "chosen",
+    [("ssail",), ("dnri",), ("dnri", "variational.decoder=recurrent", "curriculum.name=none")],
+    ids=["ssail", "dnri", "dnri recurrent"],
+)
+def test_so_does_a_resumed_run_on_recorded_motion(chosen: tuple[str, ...], toy: ToySpec, tmp_path: Path) -> None:
+    check_resumed(toy(*chosen, "training.epochs=4"), tmp_path / "state.pt")
 
 
 def test_the_alpha_range_leaves_weights_and_data_order_alone(spec: RunSpec) -> None:
@@ -143,6 +158,27 @@ def test_the_best_model_uses_every_mode_if_one_does(spec: RunSpec) -> None:
     assert kept == [(True, 1), (False, 1), (True, 3), (False, 3), (True, 5), (False, 5)]
     loop._select(*loop.evaluator.rank({"validation/mode_mse": math.nan, "validation/lane_balance": 0.5}))
     assert not loop.improved
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_predicts_recorded_motion(method: str, toy: ToySpec) -> None:
+    """Shortly trained, it has the metrics that all are compared by."""
+    loop = TrainingLoop(toy(method), 0)
+    if loop.spec.epochs:
+        record = loop.run_epoch()
+        assert {"validation/mse", "validation/mse_1", "train/mse", "seconds"} <= record.keys()
+        assert all(map(math.isfinite, record.values()))
+        assert loop.best_epoch == 1
+    values, _ = loop.final_evaluation()
+    assert {"test/mse_10", "test_noisy/mse_10", "test_constant_velocity/mse_10", "test/diverged"} <= values.keys()
+    assert all(map(math.isfinite, values.values()))
+
+
+def test_a_data_file_of_the_other_environment_is_refused(recorded: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"mocap\.npz is an expert set of mocap, not of yjunction; train with --env mo"
+    ):
+        TrainingLoop(build_spec("ssail", "yjunction", "smoke", [f"data.path={recorded}"]), 0)
 
 
 @pytest.mark.parametrize("method", LEARNING)

@@ -1,0 +1,104 @@
+"""What a spec holds in each environment, and what it is known by."""
+
+import pytest
+from pydantic import ValidationError
+
+from ssmail import spec as specs
+from ssmail.errors import InputError
+from ssmail.experiments import build_spec
+from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+@pytest.mark.parametrize("method", METHODS)
+def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, environment: str) -> None:
+    made = build_spec(method, environment, "smoke")
+    there = {name for name in OPTIONAL_SECTIONS if getattr(made, name) is not None}
+    assert there == set(sections_of(method, environment)) == {*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment]}
+    assert (made.forecast is not None) is (environment == "mocap")
+    assert (made.data.yjunction is not None) is (environment == "yjunction")
+    assert (made.data.path is not None) is (environment == "mocap")
+
+
+@pytest.mark.parametrize(
+    ("environment", "changes", "sentence"),
+    [
+        ("yjunction", {"forecast": "of mocap"}, "bc on yjunction has no section forecast"),
+        ("mocap", {"forecast": None}, "bc on mocap needs section forecast"),
+        ("mocap", {"cloning": None}, "bc on mocap needs section cloning"),
+        ("yjunction", {"data": {"path": None, "yjunction": None}}, "environment yjunction needs data.yjunction"),
+        ("mocap", {"data": {"path": None, "yjunction": None}}, "environment mocap needs a data file; set data.path"),
+    ],
+)
+def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict[str, object], sentence: str) -> None:
+    forecast = build_spec("bc", "mocap", "smoke").forecast
+    changes = {name: forecast if value == "of mocap" else value for name, value in changes.items()}
+    values = {**build_spec("bc", environment, "smoke").model_dump(), **changes}
+    with pytest.raises(ValidationError, match=sentence):
+        RunSpec.from_mapping(values)
+
+
+@pytest.mark.parametrize(
+    ("environment", "override", "sentence"),
+    [
+        (
+            "yjunction",
+            "forecast.noise=0.1",
+            "method bc on yjunction has no section 'forecast' to set in --set; it belongs to mocap.",
+        ),
+        ("mocap", "data.yjunction.train=3", "environment mocap has no section 'data.yjunction' to set in --set."),
+        ("mocap", "data.path=null", "environment mocap needs a data file; set data.path"),
+        ("mocap", "forecast.observed=0", "forecast.observed = 0 in --set should be greater than or equal to 1."),
+        ("mocap", "forecast.noise_on=some", "forecast.noise_on = some in --set should be 'all' or 'history'."),
+    ],
+)
+def test_a_bad_override_is_one_sentence(environment: str, override: str, sentence: str) -> None:
+    with pytest.raises(InputError) as caught:
+        build_spec("bc", environment, "smoke", [override])
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_a_field_or_section_that_is_added_as_null_leaves_the_hash_as_it_was(environment: str) -> None:
+    """So that runs that are stored go on being those of the spec; once it has a value the hash is another."""
+
+    class Adversarial(specs.AdversarialSpec):
+        later: int | None
+
+    class Later(RunSpec):
+        adversarial: Adversarial | None
+        football: specs.ForecastSpec | None
+
+    now = build_spec("gail", environment, "smoke")
+    values = now.model_dump()
+    values["adversarial"]["later"] = None
+    values["football"] = None
+    assert Later.model_validate(values).hash() == now.hash()
+    assert Later.model_validate(values).as_json() != now.as_json()
+    values["adversarial"]["later"] = 0
+    assert Later.model_validate(values).hash() != now.hash()
+
+
+def test_a_null_and_a_value_are_different_specs() -> None:
+    """The limit of rewards is null on the Y-Junction."""
+    made = {build_spec("gail", "yjunction", "smoke", [f"adversarial.reward_limit={v}"]).hash() for v in ("null", "1.0")}
+    assert build_spec("gail", "yjunction", "smoke").hash() in made
+    assert len(made) == 2
+
+
+@pytest.mark.parametrize(
+    ("given", "density", "pieces"),
+    [
+        ("[0,1]", (0.0, 1.0), ((0.0, 1.0, 1.0),)),
+        ("[[-1,0,1],[0.5,1,3]]", ((-1.0, 0.0, 1.0), (0.5, 1.0, 3.0)), ((-1.0, 0.0, 1.0), (0.5, 1.0, 3.0))),
+    ],
+)
+def test_alpha_is_a_range_or_weighted_ranges(given: str, density: object, pieces: object) -> None:
+    """It survives JSON, where tuples are lists."""
+    made = build_spec("ssail", "yjunction", "smoke", [f"self_supervision.alpha={given}"])
+    assert made.self_supervision is not None
+    assert (made.self_supervision.alpha, made.self_supervision.alpha_pieces) == (density, pieces)
+    again = RunSpec.model_validate_json(made.as_json())
+    assert again == made
+    assert again.hash() == made.hash() != build_spec("ssail", "yjunction", "smoke").hash()
