@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from ssmail.spec import CurriculumSpec
 from ssmail.training.curricula import (
+    curriculum_metrics,
     draw_interventions,
     expected_segment_length,
     intervention_frequency,
@@ -101,3 +102,14 @@ def test_segment_length_against_simulation_and_formula(frequency: float) -> None
             length += 1
         counted.append(length)
     assert mean_segment_length(mask[:200]) == pytest.approx(sum(counted) / len(counted))
+
+
+def test_what_is_stored_of_an_epoch_by_hand() -> None:
+    """Two masks of two trajectories of 4 steps: 8 steps in 2 + 2 segments, and in 2; the mean of 2 and 4."""
+    some, none = torch.zeros(2, 4, dtype=torch.bool), torch.zeros(2, 4, dtype=torch.bool)
+    some[0, 1] = some[1, 3] = True
+    assert curriculum_metrics(0.25, [some, none]) == {
+        "curriculum/intervention_frequency": 0.25,
+        "curriculum/segment_length": 3.0,
+        "curriculum/expected_segment_length": pytest.approx(4 / 1.75),
+    }
