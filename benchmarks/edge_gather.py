@@ -99,14 +99,14 @@ class GatherDynamicEncoder(nn.Module):
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         edges = GatherEmbedding(self.dense.embedding)(x)
         b, t, e, h = edges.shape
-        sequences = edges.transpose(1, 2).reshape(b * e, t, h)
+        sequences = edges.transpose(0, 1).reshape(t, b * e, h)
         if e == 0:
             nothing = x.new_zeros(b, t, x.shape[2], x.shape[2], self.dense.prior_head[-1].out_features)
             return nothing, nothing
         past = self.dense.past(sequences)[0]
-        both = torch.cat([past, self.dense.future(sequences.flip(1))[0].flip(1)], dim=-1)
-        prior = self.dense.prior_head(past).view(b, e, t, -1).transpose(1, 2)
-        posterior = self.dense.posterior_head(both).view(b, e, t, -1).transpose(1, 2)
+        both = torch.cat([past, self.dense.future(sequences.flip(0))[0].flip(0)], dim=-1)
+        prior = self.dense.prior_head(past).view(t, b, e, -1).transpose(0, 1)
+        posterior = self.dense.posterior_head(both).view(t, b, e, -1).transpose(0, 1)
         return as_graph(prior, x.shape[2]), as_graph(posterior, x.shape[2])
 
 

@@ -111,8 +111,8 @@ class RecurrentDecoder(nn.Module):
         from_inputs = self.inputs(x)
         hidden = x.new_zeros(b, n, self.size) if memory is None else memory
         states = []
-        for step in range(t):
-            hidden = self._update(hidden, from_inputs[:, step], weights[:, step])
+        for inputs, weight in zip(from_inputs.unbind(1), weights.unbind(1), strict=True):
+            hidden = self._update(hidden, inputs, weight)
             states.append(hidden)
         a = self.action_size
         return x[..., a : 2 * a] + self.head(torch.stack(states, dim=1)), hidden

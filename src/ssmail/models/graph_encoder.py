@@ -27,7 +27,7 @@ class GraphEncoder(nn.Module):
         self.edges_in = EdgeFunction(inputs, hidden, hidden)
         self.nodes = perceptron(hidden + inputs, hidden, hidden)
         self.edges_out = EdgeFunction(hidden, hidden, hidden)
-        self.lstm = nn.LSTM(hidden, hidden, batch_first=True)
+        self.lstm = nn.LSTM(hidden, hidden)
         self.head = nn.Linear(hidden, edge_types)
 
     def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
@@ -38,27 +38,27 @@ class GraphEncoder(nn.Module):
         edges = self.edges_in(x)
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
-        sequences = off_diagonal(edges).transpose(1, 2).reshape(b * n * (n - 1), t, -1)
-        embedded, memory = remember(self.lstm, sequences, memory)
-        logits = self.head(embedded).view(b, n * (n - 1), t, -1).transpose(1, 2)
+        embedded, memory = remember(self.lstm, off_diagonal(edges).transpose(0, 1).flatten(1, 2), memory)
+        logits = self.head(embedded).view(t, b, n * (n - 1), -1).transpose(0, 1)
         return on_diagonal(logits, n), memory
 
 
 def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
-    """A one-layer LSTM over (edges, T, D) -> (edges, T, H) and its memory. A single step, as in a rollout, takes the
-    cell itself, which costs half as much; without edges there is nothing to do.
+    """A one-layer LSTM over (T, edges, D) -> (T, edges, H) and its memory. Steps come first, as the LSTM works, or it
+    would copy. A single step, as in a rollout, takes the cell itself, which costs half as much; without edges there is
+    nothing to do.
     """
-    edges, steps, _ = sequences.shape
+    steps, edges, _ = sequences.shape
     if memory is None:
         zeros = sequences.new_zeros(1, edges, lstm.hidden_size)
         memory = (zeros, zeros)
     if not edges:
-        return sequences.new_zeros(0, steps, lstm.hidden_size), memory
+        return sequences.new_zeros(steps, 0, lstm.hidden_size), memory
     if steps > 1:
         embedded, (hidden, cell) = lstm(sequences, memory)
         return embedded, (hidden, cell)
-    hidden, cell = torch.lstm_cell(sequences[:, 0], [m[0] for m in memory], *lstm.all_weights[0])
-    return hidden.unsqueeze(1), (hidden.unsqueeze(0), cell.unsqueeze(0))
+    hidden, cell = torch.lstm_cell(sequences[0], [m[0] for m in memory], *lstm.all_weights[0])
+    return hidden.unsqueeze(0), (hidden.unsqueeze(0), cell.unsqueeze(0))
 
 
 def off_diagonal(pairs: Tensor) -> Tensor:

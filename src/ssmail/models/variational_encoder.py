@@ -21,7 +21,7 @@ from ssmail.spec import VariationalSpec
 def edge_type_head(inputs: int, spec: VariationalSpec) -> nn.Sequential:
     """Three layers: (..., inputs) -> logits (..., K)."""
     return nn.Sequential(
-        nn.Linear(inputs, spec.head), nn.ELU(), nn.Linear(spec.head, spec.head), nn.ELU(),
+        nn.Linear(inputs, spec.head), nn.ELU(inplace=True), nn.Linear(spec.head, spec.head), nn.ELU(inplace=True),
         nn.Linear(spec.head, spec.edge_types),
     )  # fmt: skip
 
@@ -68,8 +68,8 @@ class DynamicEncoder(nn.Module):
     def __init__(self, inputs: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.embedding = EdgeEmbedding(inputs, spec.hidden, spec.batch_norm)
-        self.past = nn.LSTM(spec.hidden, spec.memory, batch_first=True)
-        self.future = nn.LSTM(spec.hidden, spec.memory, batch_first=True)
+        self.past = nn.LSTM(spec.hidden, spec.memory)
+        self.future = nn.LSTM(spec.hidden, spec.memory)
         self.prior_head = edge_type_head(spec.memory, spec)
         self.posterior_head = edge_type_head(2 * spec.memory, spec)
 
@@ -79,7 +79,7 @@ class DynamicEncoder(nn.Module):
         """
         sequences = self._sequences(x)
         past, _ = remember(self.past, sequences, None)
-        future = remember(self.future, sequences.flip(1), None)[0].flip(1)
+        future = remember(self.future, sequences.flip(0), None)[0].flip(0)
         both = torch.cat([past, future], dim=-1)
         return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
 
@@ -92,12 +92,12 @@ class DynamicEncoder(nn.Module):
         return self._logits(self.prior_head, past, x), memory
 
     def _sequences(self, x: Tensor) -> Tensor:
-        """The embeddings along each edge: (B, T, N, F) -> (B * N * (N - 1), T, H)."""
+        """The embeddings along each edge: (B, T, N, F) -> (T, B * N * (N - 1), H)."""
         edges: Tensor = self.embedding(x)
-        return edges.flatten(2, 3).transpose(1, 2).flatten(0, 1)
+        return edges.transpose(0, 1).flatten(1, 3)
 
     def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:
-        """(B * N * (N - 1), T, H) -> (B, T, N, N, K)."""
+        """(T, B * N * (N - 1), H) -> (B, T, N, N, K)."""
         b, t, n, _ = x.shape
         logits: Tensor = head(sequences)
-        return edge_graph(logits.view(b, n, n - 1, t, logits.shape[-1]).permute(0, 3, 1, 2, 4))
+        return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))
