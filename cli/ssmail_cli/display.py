@@ -9,9 +9,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ssmail.errors import InputError, SsmailError
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 Row = Mapping[str, Any]
 
@@ -72,34 +75,43 @@ def write_json(value: Any, out: Path | None) -> None:
     _to(out, lambda file: print(json.dumps(_json_value(value), indent=2), file=file))
 
 
-def short(value: Any) -> str:
-    """A value as a table shows it: four significant digits, month to minute of UTC, a dash for nothing."""
+def short(value: Any, digits: int = 4) -> str:
+    """A value as a table shows it: so many significant digits, month to minute of UTC, a dash for nothing."""
     if value is None or value == "":
         return "-"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return f"{value:.{digits}g}"
     if isinstance(value, datetime):
         return f"{value:%m-%d %H:%M}"
     return str(value)
 
 
 def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
-    """A table on stdout, its columns two spaces apart where the terminal is wide enough, else one."""
+    """A table on stdout: columns two spaces apart and four digits, or, in a terminal too narrow for it, one space, or
+    one space and three digits.
+    """
     from rich.console import Console
     from rich.measure import Measurement
+
+    console = Console()
+    unlimited = console.options.update(max_width=10_000)
+    for gap, digits in ((2, 4), (1, 4), (1, 3)):
+        table = _table(rows, columns, gap, digits)
+        if Measurement.get(console, unlimited, table).maximum <= console.width:
+            break
+    console.print(table)
+
+
+def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":
     from rich.table import Table
 
-    cells = [[short(row.get(key)) for key in columns] for row in rows]
-    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0))
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
         table.add_column(heading, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
-    for line in cells:
-        table.add_row(*map(_plain, line))
-    console = Console()
-    if Measurement.get(console, console.options.update(max_width=10_000), table).maximum > console.width:
-        table.padding = (0, 1, 0, 0)
-    console.print(table)
+    for row in rows:
+        table.add_row(*(_plain(short(row.get(key), digits)) for key in columns))
+    return table
 
 
 def _plain(text: str) -> Any:

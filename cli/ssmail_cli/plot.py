@@ -10,6 +10,7 @@ from ssmail.errors import InputError
 from ssmail_cli.display import note
 from ssmail_cli.figure_options import DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
+from ssmail_cli.results import SHOWN, shown_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
 
 SKELETON = "skeleton"
-DEFAULT_METRIC, DEFAULT_GROUPS = "train/mode_mse", "method"
+DEFAULT_GROUPS = "method"
+DEFAULT_METRICS = "; ".join(f"{shown.curve} of {name}" for name, shown in SHOWN.items())
 DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
 
 
@@ -53,7 +55,7 @@ def plot(
     ] = None,
     metrics: Annotated[
         list[str] | None,
-        typer.Option("--metric", help="training: draw this metric; repeatable.", show_default=DEFAULT_METRIC),
+        typer.Option("--metric", help="training: draw this metric; repeatable.", show_default=DEFAULT_METRICS),
     ] = None,
     methods: Annotated[
         list[str] | None, typer.Option("--method", help="training: only runs of this method; repeatable.")
@@ -109,7 +111,8 @@ def plot(
             _draw_skeleton(data or Path(DEFAULT_DATA), split or DEFAULT_SPLIT, window or 0, bool(animate), out, formats)
         elif name == TRAINING:
             chosen = _chosen(store, ids, methods, environment, profile)
-            _draw_training(chosen, store, metrics or [DEFAULT_METRIC], group_by, statistic, out, formats)
+            usual = list(dict.fromkeys(shown_on(run.environment).curve for run in chosen))
+            _draw_training(chosen, store, metrics or usual, group_by, statistic, out, formats)
         else:
             record = FIGURES[name].collect(store, ids, profile=profile, statistic=statistic)
             _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)

@@ -1,12 +1,12 @@
 """How a sweep shows itself on stderr: live lines on a terminal, a few log lines elsewhere."""
 
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from ssmail_cli.display import note, short
+from ssmail_cli.results import SHOWN, shown_on
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 Sweep = Mapping["Cell", Mapping[str, Any]]  # what each cell is called; see ssmail_cli.sweep
 Report = Callable[["Event"], None]
 
-LABELS = {
-    "validation/mode_mse": "val",
+LABELS = dict.fromkeys((shown.validation for shown in SHOWN.values()), "val") | {
     "discriminator/loss": "disc",
     "critic/loss": "critic",
     "actor/loss": "actor",
+    "cloning/loss": "loss",
 }
 LOG_LINES = 10  # of the epochs of one run
 FEW = 10  # so many cells have a line each from the beginning, and a log of their epochs
@@ -140,11 +140,12 @@ def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
 def _headline(event: "Event") -> str:
     """What happened to the run, in a few words."""
     run = f" (run {event.run_id[:8]})" if event.run_id else ""
+    error = event.metrics.get(shown_on(event.cell.spec.environment).error)
     words = {
         "started": f"started{run}",
         "resumed": f"resumed after epoch {event.epoch}{run}",
         "skipped": f"skipped: {event.message}",
-        "finished": f"finished{run}: test error {event.metrics.get('test/mode_mse', math.nan):.4g}",
+        "finished": f"finished{run}" + ("" if error is None else f": test error {error:.4g}"),
     }
     return words.get(event.kind, f"{event.kind}{run}")
 

@@ -10,7 +10,7 @@ import typer
 from ssmail.errors import InputError
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
-from ssmail_cli.results import KEY_METRICS, rows_with_metrics, run_row
+from ssmail_cli.results import rows_with_metrics, run_row, shown_on
 
 if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
@@ -27,7 +27,6 @@ RUN_COLUMNS = {
     "seed": "seed",
     "spec": "spec",
     "started": "start (UTC)",
-    "test/mode_mse": "mode_mse",
 }
 EXPORT_COLUMNS = ("run_id", "method", "environment", "profile", "seed", "state", "spec_hash", "name", "step", "value")
 
@@ -52,12 +51,13 @@ def list_runs(
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
         note(f"no run in {db} meets these conditions")
-    rows = rows_with_metrics(store, runs, ["test/mode_mse"])
+    errors = list(dict.fromkeys(shown_on(run.environment).error for run in runs))
+    rows = rows_with_metrics(store, runs, errors)
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
-        print_table([{**row, "spec": row["spec_hash"][:8]} for row in rows], RUN_COLUMNS)
+        _print_list(rows, errors)
     else:
-        print_rows(rows, RUN_COLUMNS, kind)
+        print_rows(rows, {**RUN_COLUMNS, **dict.fromkeys(errors, "")}, kind)
 
 
 @app.command()
@@ -86,7 +86,7 @@ def compare(
     ids: options.RunIds = None,
     metrics: Annotated[
         list[str] | None,
-        typer.Option("--metric", help="Compare this metric; repeatable.", show_default=", ".join(KEY_METRICS)),
+        typer.Option("--metric", help="Compare this metric; repeatable.", show_default="those of the environment"),
     ] = None,
     method: options.Method = None,
     environment: options.Environment = None,
@@ -102,13 +102,11 @@ def compare(
     Shows mean, standard deviation (n - 1), median and the value of each seed's newest run. Runs that differ in the seed
     alone are one group. No run is left out: one without the metric shows its state.
     """
-    from ssmail.store.comparison import compare as compare_runs
-
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
         note(f"no run in {db} meets these conditions")
-    found = compare_runs(store, runs, metrics or KEY_METRICS)
+    found = _compared(store, runs, metrics)
     for metric in metrics or ():
         if runs and not any(item.known for item in found if item.metric == metric):
             raise InputError(
@@ -116,7 +114,7 @@ def compare(
             )
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
-        _print_comparisons(found, metrics or KEY_METRICS)
+        _print_comparisons(found)
         return
     seeds = sorted({seed for item in found for seed in item.values})
     print_rows([_comparison_row(item, seeds, kind) for item in found], {}, kind)
@@ -221,10 +219,39 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"section": "artifact", "name": item["name"], "step": None, "value": item["path"]}
 
 
-def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> None:
-    """A table for each spec: its seeds downwards, then mean, std and median; the metrics across."""
-    names = {metric: metric.replace("_constant_velocity", " constant velocity") for metric in metrics}
-    headings = {metric: name.replace("/", "/\n") for metric, name in names.items()}
+def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> None:
+    """Runs downwards, with one column for the test error, whatever it is called in the environment of each."""
+    name = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
+    short_rows = [
+        {**row, "spec": row["spec_hash"][:8], "error": row[shown_on(row["environment"]).error]} for row in rows
+    ]
+    print_table(short_rows, {**RUN_COLUMNS, "error": name})
+
+
+def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] | None) -> "list[Comparison]":
+    """Environment by environment, by the metrics asked for or by those of each."""
+    from ssmail.store.comparison import compare as compare_runs
+
+    return [
+        item
+        for environment in dict.fromkeys(run.environment for run in runs)
+        for item in compare_runs(
+            store,
+            [run for run in runs if run.environment == environment],
+            metrics or list(shown_on(environment).metrics),
+        )
+    ]
+
+
+def _headings(group: "list[Comparison]") -> dict[str, str]:
+    names = {item.metric: item.metric.replace("_constant_velocity", " constant\nvelocity") for item in group}
+    return {metric: name.replace("/", "/\n") for metric, name in names.items()}
+
+
+def _print_comparisons(found: "list[Comparison]") -> None:
+    """A table for each spec: its seeds downwards, then mean, std and median; the metrics across. Then one for all specs
+    of an environment.
+    """
     specs = _by_spec(found)
     for group in specs:
         first = group[0]
@@ -236,10 +263,11 @@ def _print_comparisons(found: "list[Comparison]", metrics: Sequence[str]) -> Non
             rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
         differs = "".join(f", {key}={short(value)}" for key, value in first.differs.items())
         print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
-        print_table(rows, {"seed": "seed", **headings})
+        print_table(rows, {"seed": "seed", **_headings(group)})
         print()
-    if len(specs) > 1:
-        _print_overview(specs, headings)
+    environments = dict.fromkeys(group[0].environment for group in specs)
+    overviews = [[group for group in specs if group[0].environment == name] for name in environments]
+    _print_overviews([alike for alike in overviews if len(alike) > 1])
 
 
 def _by_spec(found: "list[Comparison]") -> "list[list[Comparison]]":
@@ -247,17 +275,22 @@ def _by_spec(found: "list[Comparison]") -> "list[list[Comparison]]":
     return [list(group) for _, group in groupby(found, key=lambda item: item.spec_hash)]
 
 
-def _print_overview(specs: "list[list[Comparison]]", headings: Mapping[str, str]) -> None:
-    """A row for each spec; `seeds` tells how many of its seeds have the first metric."""
-    rows: list[dict[str, Any]] = []
-    for group in specs:
-        first = group[0]
-        differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
-        spec = f"{first.method} {differs or first.spec_hash[:8]}"
-        seeds = f"{len(first.known)}/{len(first.values)}"
-        rows.append({"spec": spec, "seeds": seeds, **{item.metric: _mean_and_std(item) for item in group}})
-    print("mean ± standard deviation; seeds: how many have the first metric, of how many")
-    print_table(rows, {"spec": "spec", "seeds": "seeds", **headings})
+def _print_overviews(environments: "list[list[list[Comparison]]]") -> None:
+    """For each environment a row for each spec; `seeds` tells how many of its seeds have the first metric."""
+    for number, specs in enumerate(environments):
+        where = specs[0][0].environment
+        between = "\n" if number else ""
+        print(f"{between}{where}: mean ± standard deviation; seeds: with the first metric, of all")
+        columns = {"spec": "spec", "seeds": "seeds", **_headings(specs[0])}
+        print_table([_overview_row(group) for group in specs], columns)
+
+
+def _overview_row(group: "list[Comparison]") -> dict[str, Any]:
+    first = group[0]
+    differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
+    spec = f"{first.method} {differs or first.spec_hash[:8]}"
+    seeds = f"{len(first.known)}/{len(first.values)}"
+    return {"spec": spec, "seeds": seeds, **{item.metric: _mean_and_std(item) for item in group}}
 
 
 def _mean_and_std(item: "Comparison") -> str | None:

@@ -12,7 +12,7 @@ from ssmail.errors import InputError
 from ssmail_cli.display import chosen_format, note, print_rows
 from ssmail_cli.options import is_missing
 from ssmail_cli.progress import Sweep, label, reporter
-from ssmail_cli.results import KEY_METRICS, rows_with_metrics
+from ssmail_cli.results import key_metrics, rows_with_metrics
 from ssmail_cli.training_options import ResumeChoice
 
 if TYPE_CHECKING:
@@ -21,17 +21,6 @@ if TYPE_CHECKING:
 
 SOME_RUNS_FAILED = 3
 INTERRUPTED = 130
-
-RESULT_COLUMNS = {
-    "outcome": "outcome",
-    "run": "run",
-    "test/mode_mse": "mode_mse",
-    "test/on_lane": "on_lane",
-    "test/lane_balance": "balance",
-    "test/min_fde_20": "min_fde_20",
-    "test_constant_velocity/mode_mse": "const. velocity",
-    "wall_seconds": "seconds",
-}
 
 Rows = list[dict[str, Any]]
 
@@ -42,7 +31,7 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: ResumeChoice, device: 
 
     store = Store.open(db)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
-    print_rows(rows, {**_heading(sweep), **RESULT_COLUMNS}, chosen_format(as_json, None))
+    print_rows(rows, {**_heading(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
     return rows
 
 
@@ -59,7 +48,8 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: ResumeChoice, devic
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
     """A row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
     runs = store.runs(ids=[event.run_id for event in events if event.run_id])
-    stored = {row["id"]: row for row in rows_with_metrics(store, runs, [*KEY_METRICS, "best_epoch"])}
+    names = [*key_metrics(_environments(sweep)), "best_epoch"]
+    stored = {row["id"]: row for row in rows_with_metrics(store, runs, names)}
     return [
         {**names, "outcome": event.kind, "message": event.message}
         | stored.get(event.run_id, {"run": None, "state": None})
@@ -113,6 +103,15 @@ def plan(sweep: Sweep, db: str, resume: ResumeChoice) -> "dict[Cell, tuple[str, 
         else:
             actions[cell] = ("resume", found.row.id) if found.row else ("new", None)
     return actions
+
+
+def _environments(sweep: Sweep) -> list[str]:
+    return list(dict.fromkeys(cell.spec.environment for cell in sweep))
+
+
+def _result_columns(sweep: Sweep) -> dict[str, str]:
+    metrics = {name: heading for name, heading in key_metrics(_environments(sweep)).items() if heading}
+    return {"outcome": "outcome", "run": "run", **metrics, "wall_seconds": "seconds"}
 
 
 def _heading(sweep: Sweep) -> Mapping[str, str]:

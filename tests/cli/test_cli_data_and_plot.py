@@ -147,6 +147,24 @@ def test_training_curves_of_any_metric(cli: CommandLine, db: Path, tmp_path: Pat
     assert [Path(line).name for line in both.out.splitlines()][2:] == ["fig4_stability.png", "fig4_stability.csv"]
 
 
+def test_training_curves_of_each_environment(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    """By its own error, where no metric is asked for."""
+    writer = Store.open(db).start_run(build_spec("dnri", "mocap", "smoke"), 0, dataset_hash="e" * 64, device="cpu")
+    for epoch in (1, 2):
+        writer.epoch(epoch, {"validation/mse": 0.1 / epoch, "validation/mse_10": 0.2})
+    writer.finish(RunState.FINISHED)
+
+    def drawn(*options: str) -> list[str]:
+        outcome = cli("plot", "training", *options, "--out", tmp_path / "figures", "--db", db)
+        return [Path(line).stem for line in outcome.out.splitlines()][::2]
+
+    asked = ("--env", "mocap", "--metric", "validation/mse", "--metric", "validation/mse_10")
+    assert drawn(*asked) == ["training_validation-mse_validation-mse_10"]
+    assert drawn("--env", "mocap") == ["training_validation-mse"]
+    assert drawn("--env", "yjunction") == ["training_train-mode_mse"]
+    assert drawn() == ["training_train-mode_mse_validation-mse"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

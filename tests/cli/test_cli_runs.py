@@ -13,10 +13,11 @@ import pytest
 
 from ssmail.experiments import build_spec
 from ssmail.store import RunState, Store
-from ssmail_cli.results import KEY_METRICS
+from ssmail_cli.results import SHOWN
 from tests.cli.command_line import CommandLine
 
 ERRORS = {0: 0.004, 1: 0.006, 2: 0.011}
+KEY_METRICS = list(SHOWN["yjunction"].metrics)
 AddRun = Callable[..., str]
 
 
@@ -27,17 +28,23 @@ def store(tmp_path: Path) -> Store:
 
 @pytest.fixture
 def add(store: Store) -> AddRun:
-    """add(seed, error, *overrides, state=...) -> id of a run of three epochs."""
+    """add(seed, error, *overrides, state=..., method=..., environment=...) -> id of a run of three epochs."""
 
     def add_run(
-        seed: int, error: float, *overrides: str, state: RunState = RunState.FINISHED, method: str = "ssail"
+        seed: int,
+        error: float,
+        *overrides: str,
+        state: RunState = RunState.FINISHED,
+        method: str = "ssail",
+        environment: str = "yjunction",
     ) -> str:
-        spec = build_spec(method, "yjunction", "smoke", overrides)
+        spec = build_spec(method, environment, "smoke", overrides)
         writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
         for epoch in (1, 2, 3):
-            writer.epoch(epoch, {"validation/mode_mse": error * epoch, "critic/loss": math.inf if epoch == 2 else 0.5})
+            losses = {"critic/loss": math.inf if epoch == 2 else 0.5}
+            writer.epoch(epoch, {SHOWN[environment].validation: error * epoch, **losses})
         if state is RunState.FINISHED:
-            writer.final(3, dict.fromkeys(KEY_METRICS, error))
+            writer.final(3, dict.fromkeys(SHOWN[environment].metrics, error))
         if state is not RunState.RUNNING:
             writer.finish(state, None if state is RunState.FINISHED else f"it {state}")
         return writer.run_id
@@ -195,6 +202,73 @@ def test_specs_are_told_apart_within_their_method(runs: CommandLine, filled: dic
     add(0, 0.03, method="dnri")
     found = json.loads(runs("compare", "--json", "--metric", "test/mode_mse").out)
     assert [list(item["differs"]) for item in found] == [["sac.gamma"], ["sac.gamma"], []]
+
+
+@pytest.fixture
+def mixed(filled: dict[str, str], add: AddRun) -> dict[str, str]:
+    """The same, and three runs on mocap: two seeds of dnri and one of bc."""
+    more = {f"mocap {seed}": add(seed, 0.02 + 0.02 * seed, method="dnri", environment="mocap") for seed in (0, 1)}
+    return filled | more | {"mocap bc": add(0, 0.05, method="bc", environment="mocap")}
+
+
+def test_a_list_shows_the_error_of_each_environment(
+    runs: CommandLine, mixed: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In one column for people, under its name where that is one; in a column of its own for programs."""
+    monkeypatch.setenv("COLUMNS", "80")
+    for options, heading in (
+        (["--env", "mocap"], "mse_40"),
+        (["--env", "yjunction"], "mode_mse"),
+        ([], "error"),
+    ):
+        lines = runs("list", "--format", "table", *options).out.splitlines()
+        assert max(map(len, lines)) <= 80
+        (heads,) = (line for line in lines if line.startswith("run "))
+        assert heads.split()[-1] == heading
+        last = {line.split()[0]: line.split()[-1] for line in lines}
+        for name, error in (("mocap 1", "0.04"), ("plain 1", "0.006"), ("other 1", "-")):
+            if mixed[name][:8] in last:
+                assert last[mixed[name][:8]] == error
+    rows = {row["id"]: row for row in runs("list").rows}
+    assert (rows[mixed["mocap 1"]]["test/mse_40"], rows[mixed["mocap 1"]]["test/mode_mse"]) == ("0.04", "")
+    assert (rows[mixed["plain 1"]]["test/mse_40"], rows[mixed["plain 1"]]["test/mode_mse"]) == ("", "0.006")
+
+
+def test_each_environment_is_compared_by_its_own_metrics(
+    runs: CommandLine, mixed: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    by_spec = dict.fromkeys((row["environment"], row["spec_hash"]) for row in runs("compare").rows)
+    assert [environment for environment, _ in by_spec] == ["yjunction", "yjunction", "mocap", "mocap"]
+    for environment, spec in by_spec:
+        found = [row["metric"] for row in runs("compare").rows if row["spec_hash"] == spec]
+        assert found == list(SHOWN[environment].metrics)
+    monkeypatch.setenv("COLUMNS", "200")
+    table = runs("compare", "--format", "table").out
+    _, lanes, motion = table.split(": mean ± standard deviation")
+    assert lanes.splitlines()[-1] == "mocap"  # the end of the first overview is the heading of the second
+    assert "on_lane" in lanes
+    assert "mse_40" not in lanes
+    assert "on_lane" not in motion
+    assert [line.split()[:6] for line in motion.splitlines()[-2:]] == [
+        ["dnri", build_spec("dnri", "mocap", "smoke").hash()[:8], "2/2", "0.03", "±", "0.014"],
+        ["bc", build_spec("bc", "mocap", "smoke").hash()[:8], "1/1", "0.05", "0.05", "0.05"],
+    ]
+    assert "mse_40" not in runs("compare", "--format", "table", "--env", "yjunction").out
+
+
+def test_a_metric_that_is_asked_for_is_compared_in_every_environment(runs: CommandLine, mixed: dict[str, str]) -> None:
+    found = json.loads(runs("compare", "--json", "--metric", "test/diverged").out)
+    assert [(item["environment"], item["values"]) for item in found] == [
+        ("yjunction", 3), ("yjunction", 1), ("mocap", 2), ("mocap", 1)
+    ]  # fmt: skip
+    only = json.loads(runs("compare", "--json", "--metric", "test_noisy/mse_40").out)
+    assert [item["values"] for item in only] == [0, 0, 2, 1]
+
+
+def test_show_tells_everything_of_a_run_on_mocap(runs: CommandLine, mixed: dict[str, str]) -> None:
+    rows = {(row["section"], row["name"]): row["value"] for row in runs("show", mixed["mocap 1"]).rows}
+    assert rows["metric", "test_noisy/mse_40"] == "0.04"
+    assert rows["spec", "forecast.observed"] == "50"
 
 
 def test_export_writes_every_value(runs: CommandLine, filled: dict[str, str], tmp_path: Path) -> None:

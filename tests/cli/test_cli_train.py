@@ -77,6 +77,35 @@ def test_results_are_rows_in_the_order_of_the_seeds(cli: CommandLine, fake: Fake
     assert [(row["seed"], row["test/mode_mse"], row["test/min_fde_20"]) for row in found] == [(5, 0.006, None)]
 
 
+def test_results_on_mocap_have_its_own_columns(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For programs every metric by name, for people the few that matter, within 80 columns."""
+    fake()
+    mocap = (*SMOKE, "--env", "mocap", "--seeds", "0,6", "--db", db)
+    outcome = cli(*mocap)
+    assert float(outcome.rows[1]["test/mse_40"]) == pytest.approx(0.3456768)
+    assert outcome.rows[1]["test_noisy/mse_40"] == "0.00123456"
+    assert "test/mode_mse" not in outcome.rows[1]
+    lines = outcome.err.splitlines()
+    assert "seed 0: epoch 1/3  val 0.1  critic 0.5" in lines
+    assert lines[-1].endswith(": test error 0.25")
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("TERM", "dumb")  # no bold headings
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    table = cli(*mocap, "--resume", "never").out.splitlines()
+    assert max(map(len, table)) <= 80
+    assert [line.split() for line in table[:2]] == [
+        ["noisy", "const."],
+        ["seed", "outcome", "run", "mse_10", "mse_20", "mse_40", "mse_40", "velocity", "diverged", "seconds"],
+    ]
+    assert len(table) == 4  # nothing is folded
+    assert table[3].split()[3:9] == ["0.0864", "0.173", "0.346", "0.00123", "0.0457", "0"]
+    monkeypatch.setenv("COLUMNS", "120")  # room for another digit
+    monkeypatch.setenv("TERM", "xterm")  # a dumb one has 80 columns
+    assert cli(*mocap, "--resume", "never").out.splitlines()[3].split()[6:8] == ["0.001235", "0.04568"]
+
+
 def test_without_a_terminal_progress_is_a_few_lines(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
     lines = cli(*SMOKE, "--set", "training.epochs=100", "--db", db).err.splitlines()

@@ -1,0 +1,36 @@
+"""The metrics that are shown of each environment are those that its runs record."""
+
+from pathlib import Path
+
+import pytest
+
+from ssmail.experiments import build_spec
+from ssmail.spec import ENVIRONMENTS
+from ssmail.training.loop import TrainingLoop
+from ssmail_cli.progress import LABELS
+from ssmail_cli.results import SHOWN, key_metrics, shown_on
+from tests.data.mocap.handmade import write_set
+
+
+@pytest.mark.parametrize("environment", ENVIRONMENTS)
+def test_what_is_shown_is_recorded(environment: str, tmp_path: Path) -> None:
+    overrides = []
+    if environment == "mocap":
+        windows = write_set(tmp_path / "mocap.npz", frames=(101, 51, 101), window=50, test_window=100)
+        overrides = [f"data.path={windows}", "forecast.predicted=40"]
+    loop = TrainingLoop(build_spec("constant-velocity", environment, "smoke", overrides), 0)
+    shown = SHOWN[environment]
+    assert {shown.validation, shown.curve} <= loop.evaluator.epoch(loop.learner.predictor).keys()
+    assert shown.validation in LABELS
+    final, _ = loop.final_evaluation()
+    assert shown.error in shown.metrics
+    assert shown.metrics.keys() <= final.keys()
+
+
+def test_metrics_that_environments_share_come_once() -> None:
+    assert list(SHOWN) == list(ENVIRONMENTS)
+    both = key_metrics(ENVIRONMENTS)
+    assert set(both) == {name for shown in SHOWN.values() for name in shown.metrics}
+    assert list(key_metrics(["mocap"])) == list(SHOWN["mocap"].metrics)
+    assert key_metrics([]) == {}
+    assert shown_on("football") is SHOWN["yjunction"]
