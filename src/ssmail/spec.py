@@ -178,6 +178,8 @@ class SacSpec(Frozen):
     polyak: Annotated[float, Field(gt=0, le=1)]
     actor_learning_rate: Positive
     actor_learning_rate_final: Share  # the last epoch's rate as a fraction of the first's; the temperature's too
+    # fraction of the epochs in which the critics and the discriminator learn and the actor does not; null: none
+    actor_start: Annotated[float, Field(gt=0, lt=1)] | None
     critic_learning_rate: Positive
     critic_learning_rate_final: Share
     temperature: NonNegative  # the fixed one, or the first one when automatic

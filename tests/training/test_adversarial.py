@@ -127,3 +127,20 @@ def test_rewards_are_kept_within_their_limit() -> None:
         states, actions = loop.experts.states[:, :-1], loop.experts.actions
         rewards = made._reward(made.features(states, states[:, 0]), actions)
         assert (float(rewards.abs().max().detach()) <= 1) is within
+
+
+def test_the_actor_waits_for_its_start_while_its_judges_learn() -> None:
+    """Epochs 0 and 1 of 4 with a start at half; from the start on, and without one, the policy moves in every epoch."""
+    for start, moving in (("0.5", [False, False, True, True]), ("null", [True] * 4)):
+        made, _ = learner(f"sac.actor_start={start}", "training.epochs=4")
+        for epoch, moves in enumerate(moving):
+            parts = (made.actor_critic.policy, made.actor_critic.critic, made.discriminator)
+            before = [[p.clone() for p in part.parameters()] for part in parts]
+            temperature = made.actor_critic.temperature.clone()
+            made.run_epoch(epoch)
+            policy, critic, discriminator = (
+                any(not torch.equal(old, new) for old, new in zip(olds, part.parameters(), strict=True))
+                for olds, part in zip(before, parts, strict=True)
+            )
+            assert (policy, critic, discriminator) == (moves, True, True)
+            assert torch.equal(temperature, made.actor_critic.temperature) is not moves

@@ -72,10 +72,13 @@ class ActorCritic:
         fixed = torch.tensor(self.spec.temperature, device=self.device)
         return self.log_temperature.detach().exp() if self.spec.automatic_temperature else fixed
 
-    def update(self, batch: Batch, chosen: Callable[[int], Tensor], reward: Reward) -> dict[str, Tensor]:
+    def update(
+        self, batch: Batch, chosen: Callable[[int], Tensor], reward: Reward, *, actor_learns: bool = True
+    ) -> dict[str, Tensor]:
         """One SAC step on the transitions of whole trajectories; `chosen` draws the time steps to use of T.
 
-        Rewards are computed anew from the stored states and actions.
+        Rewards are computed anew from the stored states and actions. Without `actor_learns` the policy and its
+        temperature stay, and the critics learn what it is worth.
         """
         at = self._transitions(batch, chosen)
         with torch.no_grad():
@@ -87,7 +90,7 @@ class ActorCritic:
             target = critic_target(rewards, next_q, next_log_prob, self.temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
         self._step("critic", value_loss, self.critic.parameters())
-        policy_loss, log_prob = self._update_actor(at)
+        policy_loss, log_prob = self._update_actor(at, actor_learns)
         self._follow()
         return {
             "critic/loss": value_loss,
@@ -121,13 +124,14 @@ class ActorCritic:
             edge_entropy=graph_entropy(logits),
         )
 
-    def _update_actor(self, at: Transitions) -> tuple[Tensor, Tensor]:
+    def _update_actor(self, at: Transitions, learns: bool) -> tuple[Tensor, Tensor]:
         action, log_prob = self.policy.actor.sample_with_log_prob(at.x, at.graph, at.velocity, self._noise(at.actions))
         self.critic.requires_grad_(False)
         loss = actor_loss(self.critic(at.x, action, at.graph.detach()), log_prob, self.temperature)
         self.critic.requires_grad_(True)
-        self._step("actor", loss - self.spec.graph_entropy * at.edge_entropy, self.policy.parameters())
-        if self.spec.automatic_temperature:
+        if learns:
+            self._step("actor", loss - self.spec.graph_entropy * at.edge_entropy, self.policy.parameters())
+        if learns and self.spec.automatic_temperature:
             target_entropy = self.spec.target_entropy * at.actions.shape[-1]
             self._step(
                 "temperature", temperature_loss(self.log_temperature, log_prob, target_entropy), [self.log_temperature]

@@ -91,7 +91,8 @@ class AdversarialLearner:
         self.rates.set(epoch)
         latest, interventions = self.generate(frequency)
         self.replay.add(latest)
-        values = mean_of([self.update(latest) for _ in range(self.training.updates)])
+        actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
+        values = mean_of([self.update(latest, actor_learns=actor_learns) for _ in range(self.training.updates)])
         return values | curriculum_metrics(frequency, [interventions])
 
     def generate(self, frequency: float) -> tuple[Batch, Tensor]:
@@ -112,10 +113,12 @@ class AdversarialLearner:
         )
         return Batch(made.states, made.actions, source), interventions
 
-    def update(self, latest: Batch) -> dict[str, float]:
+    def update(self, latest: Batch, *, actor_learns: bool = True) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
         logs = [self._update_discriminator(latest) for _ in range(self.adversarial.updates)]
-        values = self.actor_critic.update(self._actor_batch(), self._pick_steps, self._reward)
+        values = self.actor_critic.update(
+            self._actor_batch(), self._pick_steps, self._reward, actor_learns=actor_learns
+        )
         return mean_of(logs) | {name: float(value.detach()) for name, value in values.items()}
 
     def _update_discriminator(self, latest: Batch) -> dict[str, float]:
