@@ -73,13 +73,15 @@ def write_json(value: Any, out: Path | None) -> None:
 
 
 def short(value: Any) -> str:
-    """A value as a table shows it: four significant digits, month to minute of UTC, a dash for nothing."""
+    """A value as a table shows it: four significant digits, month to minute of UTC, a dash for nothing; or a list."""
     if value is None or value == "":
         return "-"
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, datetime):
         return f"{value:%m-%d %H:%M}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(short, value))}]"
     return str(value)
 
 
