@@ -1,6 +1,10 @@
 """What stored metrics are called and measured in on an axis, and which of them are errors."""
 
+from ssmail.evaluation.protocol import STEPS
+
 UNITS = {
+    "mse": "squared scaled units",
+    **{f"mse_{step}": "squared scaled units" for step in STEPS},
     "mode_mse": "squared scaled units",
     "one_step_mse": "squared scaled units",
     "lag": "scaled units",
@@ -16,7 +20,9 @@ UNITS = {
     "intervention_frequency": "per step",
     "best_epoch": "epochs",
 }
-ERRORS = frozenset({"mode_mse", "one_step_mse", "ade", "fde", "min_ade_20", "min_fde_20"})
+ERRORS = frozenset(
+    {"mse", *(f"mse_{step}" for step in STEPS), "mode_mse", "one_step_mse", "ade", "fde", "min_ade_20", "min_fde_20"}
+)
 
 
 def label(metric: str) -> str:
