@@ -33,7 +33,8 @@ def plot(
         list[str],
         typer.Argument(
             metavar="FIGURE...",
-            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), training, skeleton.",
+            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig7 (noise), fig9 (yjunction), "
+            "training, skeleton.",
         ),
     ],
     out: OutDir = Path("results/figures"),
@@ -52,7 +53,7 @@ def plot(
         str | None,
         typer.Option(
             "--stat",
-            help="Centre and band of fig3, fig4, fig6 and training: mean-std, median-iqr or mean-ci.",
+            help="Centre and band of fig3, fig4, fig6, fig7 and training: mean-std, median-iqr or mean-ci.",
             show_default="mean-std",
         ),
     ] = None,

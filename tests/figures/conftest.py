@@ -10,7 +10,7 @@ from ssmail.experiments import ablation_specs, build_spec
 from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store
 
-from .handmade_arrays import arrays
+from .handmade_arrays import arrays, forecasts
 
 AddRun = Callable[..., str]
 
@@ -49,6 +49,29 @@ def add_run(store: Store) -> AddRun:
         if state is not RunState.RUNNING:
             writer.finish(state)
         return writer.run_id
+
+    return add
+
+
+@pytest.fixture
+def add_forecast(add_run: AddRun) -> AddRun:
+    """add_forecast(seed, level, method="ssail", state, overrides, slope, steps) -> id of a mocap run of profile smoke;
+    a finished one has handmade_arrays.forecasts, or the errors given as `errors`.
+    """
+
+    def add(
+        seed: int = 0,
+        level: float = 0.001,
+        method: str = "ssail",
+        state: RunState = RunState.FINISHED,
+        *,
+        overrides: Sequence[str] = (),
+        errors: Mapping[str, np.ndarray] | None = None,
+        **shape: Any,
+    ) -> str:
+        spec = build_spec(method, "mocap", "smoke", overrides)
+        found = {**forecasts(level, **shape), **(errors or {})}
+        return add_run(seed, [1.0], state, spec=spec, **found)
 
     return add
 

@@ -20,6 +20,8 @@ def test_names_and_aliases_lead_to_the_same_figure() -> None:
         "modes": "fig5",
         "fig6": "fig6",
         "beta": "fig6",
+        "fig7": "fig7",
+        "noise": "fig7",
         "fig9": "fig9",
         "yjunction": "fig9",
     }

@@ -89,6 +89,7 @@ _MODULES = (
     FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
     FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", has_statistic=True),
+    FigureModule("fig7", "noise", "mocap: test error against the predicted step, clean and noisy", has_statistic=True),
     FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
 )
 

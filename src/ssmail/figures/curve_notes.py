@@ -19,16 +19,16 @@ def cut(bands: Sequence[Band]) -> tuple[str, ...]:
     return (f"the band of {'; '.join(labels)} {where}; the CSV has its numbers.",)
 
 
-def high(bands: Sequence[Band]) -> tuple[str, ...]:
-    """How many runs rise above the end of a scale of errors."""
-    counts = {shown.label: sum(_rises(curve) for curve in shown.curves) for shown in bands}
+def high(bands: Sequence[Band], end: float = CEILING) -> tuple[str, ...]:
+    """How many runs rise above the end of a scale."""
+    counts = {shown.label: sum(_rises(curve, end) for curve in shown.curves) for shown in bands}
     return tuple(
-        f"{label}: {n} of the runs rise above {CEILING:g}, where the scale ends." for label, n in counts.items() if n
+        f"{label}: {n} of the runs rise above {end:.3g}, where the scale ends." for label, n in counts.items() if n
     )
 
 
-def _rises(curve: Curve) -> bool:
-    return bool((np.isfinite(curve.values) & (curve.values > CEILING)).any())
+def _rises(curve: Curve, end: float) -> bool:
+    return bool((np.isfinite(curve.values) & (curve.values > end)).any())
 
 
 def comparisons(bands: Sequence[Band]) -> tuple[str, ...]:
