@@ -64,8 +64,8 @@ def ablate(
         print_plan(sweep, db, resume, as_json)
         return
     rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
-    if sys.stdout.isatty() and not is_interrupted(rows) and environment in (None, ablation(name).environment):
-        _point_to_figures(name, db)
+    if sys.stdout.isatty() and not is_interrupted(rows):
+        _point_to_figures(name, environment, db)
     finish(sweep, rows)
 
 
@@ -109,12 +109,15 @@ def _column(key: str) -> str:
     return key if last in taken else last
 
 
-def _point_to_figures(name: str, db: str) -> None:
-    """A line for each figure that draws the ablation."""
-    from ssmail.experiments import figure_requirements, load_experiments
+def _point_to_figures(name: str, environment: str | None, db: str) -> None:
+    """A line for each figure that draws the ablation, on that environment."""
+    from ssmail.experiments import ablation, figure_requirements, load_experiments
     from ssmail.figures import FIGURES
 
-    where = "" if db == DEFAULT_DATABASE else f" --db {db}"
+    elsewhere = environment not in (None, ablation(name).environment)
+    where = f" --env {environment}" if elsewhere else ""
+    where += "" if db == DEFAULT_DATABASE else f" --db {db}"
     for figure in load_experiments().figures:
-        if figure in FIGURES and figure_requirements(figure).ablation == name:
+        drawn = figure in FIGURES and figure_requirements(figure).ablation == name
+        if drawn and (not elsewhere or FIGURES[figure].has_environment):
             note(f"`ssmail plot {figure}{where}` draws these runs")

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.figures import FigureRecord
+    from ssmail.figures import FigureModule, FigureRecord
     from ssmail.store import RunRow, Store
 
 TRAINING, SKELETON = "training", "skeleton"
@@ -33,8 +33,8 @@ def plot(
         list[str],
         typer.Argument(
             metavar="FIGURE...",
-            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig7 (noise), fig9 (yjunction), "
-            "training, skeleton.",
+            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig7 (noise), fig8 (alpha), "
+            "fig9 (yjunction), training, skeleton.",
         ),
     ],
     out: OutDir = Path("results/figures"),
@@ -53,7 +53,7 @@ def plot(
         str | None,
         typer.Option(
             "--stat",
-            help="Centre and band of fig3, fig4, fig6, fig7 and training: mean-std, median-iqr or mean-ci.",
+            help="Centre and band of fig3, fig4, fig6, fig7, fig8 and training: mean-std, median-iqr or mean-ci.",
             show_default="mean-std",
         ),
     ] = None,
@@ -64,7 +64,10 @@ def plot(
     methods: Annotated[
         list[str] | None, typer.Option("--method", help="training: only runs of this method; repeatable.")
     ] = None,
-    environment: Annotated[str | None, typer.Option("--env", help="training: only runs on this environment.")] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option("--env", help="training, fig8: runs on this environment.", show_default="any; of fig8 mocap"),
+    ] = None,
     group_by: Annotated[
         str | None,
         typer.Option(
@@ -98,10 +101,12 @@ def plot(
 
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
     _check(figures, formats or [])
-    training = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
+    training = {"--metric": metrics, "--method": methods, "--group-by": group_by}
     skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
-    _check_owner(TRAINING, training, figures)
-    _check_owner(SKELETON, skeleton, figures)
+    _check_owner([TRAINING], training, figures)
+    _check_owner([SKELETON], skeleton, figures)
+    of_any = [key for key, module in FIGURES.items() if module.has_environment]
+    _check_owner([TRAINING, *of_any], {"--env": environment}, figures)
     if ids and profile and figures != [TRAINING]:
         raise InputError("--runs names the runs already; leave --profile out.")
     statistic = _statistic(stat, figures)
@@ -116,8 +121,9 @@ def plot(
             chosen = _chosen(store, ids, methods, environment, profile)
             _draw_training(chosen, store, metrics or [DEFAULT_METRIC], group_by, statistic, out, formats)
         else:
-            record = FIGURES[name].collect(store, ids, profile=profile, statistic=statistic)
-            _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)
+            module = FIGURES[name]
+            record = module.collect(store, ids, profile=profile, statistic=statistic, environment=environment)
+            _save(name, _stem(module, environment), record, module.draw(record), out, formats)
 
 
 def _check(figures: Sequence[str], formats: Sequence[str]) -> None:
@@ -134,12 +140,22 @@ def _check(figures: Sequence[str], formats: Sequence[str]) -> None:
             raise unknown_name("figure format", form, FORMATS)
 
 
-def _check_owner(owner: str, options: Mapping[str, object], figures: Sequence[str]) -> None:
-    """Refuse the options of one figure beside others that know nothing of them."""
+def _check_owner(owners: Sequence[str], options: Mapping[str, object], figures: Sequence[str]) -> None:
+    """Refuse the options of some figures beside others that know nothing of them."""
     given = [option for option, value in options.items() if value is not None]
-    others = [name for name in figures if name != owner]
+    others = [name for name in figures if name not in owners]
     if given and others:
-        raise InputError(f"{given[0]} belongs to `ssmail plot {owner}`; draw {', '.join(others)} without it.")
+        names = " and ".join(f"`ssmail plot {owner}`" for owner in owners[:2])
+        raise InputError(f"{given[0]} belongs to {names}; draw {', '.join(others)} without it.")
+
+
+def _stem(module: "FigureModule", environment: str | None) -> str:
+    """The files' name without ending; of another environment than the paper's it names that."""
+    from ssmail.experiments import figure_requirements
+
+    if environment in (None, figure_requirements(module.name).environment):
+        return module.stem
+    return f"{module.stem}_{environment}"
 
 
 def _statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":

@@ -251,6 +251,7 @@ def _ablation(experiments: Experiments, name: str, environment: str | None = Non
         if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
             raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
     where = environment or entry["environment"]
+    _named(experiments.environments, "environment", where)
     check_section(entry["key"], entry["method"], where, source)
     return Ablation(name, entry["method"], where, entry["key"], frozen(entry["values"]))
 

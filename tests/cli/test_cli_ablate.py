@@ -172,6 +172,18 @@ def test_on_a_terminal_the_figure_is_named(
     assert "ssmail plot" not in cli(*options).err
 
 
+def test_of_another_environment_only_a_figure_that_draws_it_is_named(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    options = ("--profile", "smoke", "--seeds", "0", "--device", "cpu", "--db", db)
+    assert f"`ssmail plot fig8 --db {db}` draws these runs" in cli("ablate", "alpha", *options).err
+    elsewhere = cli("ablate", "alpha", "--env", "yjunction", *options)
+    assert f"`ssmail plot fig8 --env yjunction --db {db}` draws these runs" in elsewhere.err
+    assert "ssmail plot" not in cli("ablate", "beta", "--env", "mocap", "--values", "0.5", *options).err
+
+
 def test_a_second_call_computes_only_what_is_missing(
     cli: CommandLine, fake: FakeTraining, walk: Callable[[], None], db: Path
 ) -> None:

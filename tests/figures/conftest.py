@@ -77,6 +77,40 @@ def add_forecast(add_run: AddRun) -> AddRun:
 
 
 @pytest.fixture
+def vary_alpha(add_run: AddRun) -> AddRun:
+    """vary_alpha({range: [errors of seeds 0, 1, ...]}, environment="mocap") -> {range: run ids}, in profile smoke.
+
+    An error is that of the last epoch of three; None is a run that diverged in its second epoch. The terms of the
+    discriminator's loss are, seed by seed, 0.3 and 0.2 + seed / 10, then 0.2 and 0.1 + seed / 10, and once more. A
+    finished run has handmade_arrays.forecasts too.
+    """
+
+    def add(
+        results: Mapping[Any, Sequence[float | None]], environment: str = "mocap", overrides: Sequence[str] = ()
+    ) -> dict[Any, list[str]]:
+        specs = ablation_specs("alpha", "smoke", list(results), overrides, environment=environment)
+        return {
+            value: [_with_alpha(add_run, specs[value], seed, error) for seed, error in enumerate(errors)]
+            for value, errors in results.items()
+        }
+
+    return add
+
+
+def _with_alpha(add_run: AddRun, spec: RunSpec, seed: int, error: float | None) -> str:
+    errors = [0.04] if error is None else [0.04, 0.02, error]
+    epochs = {
+        "train/mse": errors,
+        "discriminator/generated": [0.3, 0.2, 0.2],
+        "discriminator/expert": [0.2 + seed / 10, 0.1 + seed / 10, 0.1 + seed / 10],
+        "discriminator/self_supervised": [9.0, 9.0, 9.0],
+    }
+    state = RunState.DIVERGED if error is None else RunState.FINISHED
+    final = {"test_constant_velocity/mse": 0.0025}
+    return add_run(seed, errors, state, spec=spec, epochs=epochs, final=final, **forecasts(errors[-1]))
+
+
+@pytest.fixture
 def ablate(add_run: AddRun) -> AddRun:
     """ablate(name, {value: [results of seeds 0, 1, ...]}) -> {value: run ids}, in profile smoke.
 

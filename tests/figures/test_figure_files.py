@@ -18,7 +18,7 @@ from ssmail.errors import InputError
 from ssmail.figures import FIGURES, provenance, save
 from ssmail.store import RunState, Store
 
-NAMES = ("fig3", "fig4", "fig5", "fig6", "fig7", "fig9")
+NAMES = ("fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "fig9")
 FORMATS = {name: provenance.FORMATS if name == "fig4" else ("svg",) for name in NAMES}  # all of each would take minutes
 
 
@@ -31,11 +31,10 @@ def filled(store: Store, add_run: Any) -> Store:
 
 
 @pytest.fixture
-def whole(filled: Store, ablate: Any, add_forecast: Any) -> Store:
+def whole(filled: Store, ablate: Any, add_forecast: Any, vary_alpha: Any) -> Store:
     """With runs for the other figures too."""
-    for method in ("ssail", "dnri"):
-        add_forecast(0, 0.001, method)
-        add_forecast(1, 0.002, method)
+    vary_alpha({(0, 1): [0.01, None], (-1, 1): [0.003, 0.002]})
+    add_forecast(0, 0.001, "dnri")
     ablate("curriculum", {"teacher-forcing": [0.04, 0.03], "trajectory-forcing": [0.02, None]})
     return filled
 

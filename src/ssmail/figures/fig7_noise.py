@@ -252,4 +252,4 @@ def _step_axis(axes: Axes, record: NoiseRecord) -> None:
     """Its ticks are the first step, the last one, and the quarters between them."""
     steps = max(panel.steps for panel in record.panels)
     axes.set_xlabel("predicted step")
-    axes.xaxis.set_major_locator(FixedLocator(np.unique([1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))])))
+    axes.xaxis.set_major_locator(FixedLocator(sorted({1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))})))
