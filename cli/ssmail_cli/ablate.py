@@ -18,12 +18,20 @@ from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_
 
 
 def ablate(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="beta or curriculum, or one of your experiments.yaml.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="alpha, beta or curriculum, or one of your experiments.yaml.")
+    ],
     values: Annotated[
         str | None,
         typer.Option(
-            "--values", help="The values, as 0,0.1,0.15; each once.", show_default="those of experiments.yaml"
+            "--values",
+            help="The values, as 0,0.1,0.15 or [0,1],[-1,1]; each once.",
+            show_default="those of experiments.yaml",
         ),
+    ] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option("--env", help="Train on this environment.", show_default="the ablation's in experiments.yaml"),
     ] = None,
     profile: options.ProfileName = "quick",
     seeds: options.Seeds = "0-4",
@@ -41,18 +49,23 @@ def ablate(
     ablation is an entry of experiments.yaml; `ssmail ablate-beta` is the same as `ssmail ablate beta`.
     """
     from ssmail.execution.local import Cell
-    from ssmail.experiments import ablation, ablation_specs
+    from ssmail.experiments import ablation, ablation_specs, as_written
 
     chosen_seeds = parse_seeds(seeds)
-    column = _column(ablation(name).key)
-    specs = ablation_specs(name, profile, None if values is None else parse_values(values), settings or [])
-    sweep = {Cell(spec, seed): {column: value, "seed": seed} for value, spec in specs.items() for seed in chosen_seeds}
+    column = _column(ablation(name, environment).key)
+    chosen_values = None if values is None else parse_values(values)
+    specs = ablation_specs(name, profile, chosen_values, settings or [], environment=environment)
+    sweep = {
+        Cell(spec, seed): {column: as_written(value), "seed": seed}
+        for value, spec in specs.items()
+        for seed in chosen_seeds
+    }
     if dry_run:
         print_plan(sweep, db, resume, as_json)
         return
     rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
     if sys.stdout.isatty() and not is_interrupted(rows):
-        _point_to_figures(name, db)
+        _point_to_figures(name, environment, db)
     finish(sweep, rows)
 
 
@@ -71,18 +84,20 @@ def alias(name: str) -> Callable[..., None]:
 
 
 def parse_values(text: str) -> list[Any]:
-    """ "0,0.1" -> [0, 0.1], each part as YAML reads it. Raises InputError where that is nothing."""
+    """ "0,0.1" -> [0, 0.1] and "[0,1],[-1,1]" -> [[0, 1], [-1, 1]], as YAML reads a list. Raises InputError where it
+    reads none, or nothing between two commas.
+    """
     import yaml
 
     from ssmail import strict_yaml
 
     try:
-        values = [strict_yaml.parse(part) for part in text.split(",")]
+        values = strict_yaml.parse(f"[{text}\n]")  # the line ends a comment, which would hide the bracket
     except yaml.YAMLError:
-        values = [None]
-    if None in values:
+        values = None
+    if not values or None in values or text.rstrip().endswith(","):
         raise InputError(f"--values takes values with commas between them, such as 0,0.15,1, not '{text}'.")
-    return values
+    return list(values)
 
 
 def _column(key: str) -> str:
@@ -94,12 +109,15 @@ def _column(key: str) -> str:
     return key if last in taken else last
 
 
-def _point_to_figures(name: str, db: str) -> None:
-    """A line for each figure that draws the ablation."""
-    from ssmail.experiments import figure_requirements, load_experiments
+def _point_to_figures(name: str, environment: str | None, db: str) -> None:
+    """A line for each figure that draws the ablation, on that environment."""
+    from ssmail.experiments import ablation, figure_requirements, load_experiments
     from ssmail.figures import FIGURES
 
-    where = "" if db == DEFAULT_DATABASE else f" --db {db}"
+    elsewhere = environment not in (None, ablation(name).environment)
+    where = f" --env {environment}" if elsewhere else ""
+    where += "" if db == DEFAULT_DATABASE else f" --db {db}"
     for figure in load_experiments().figures:
-        if figure in FIGURES and figure_requirements(figure).ablation == name:
+        drawn = figure in FIGURES and figure_requirements(figure).ablation == name
+        if drawn and (not elsewhere or FIGURES[figure].has_environment):
             note(f"`ssmail plot {figure}{where}` draws these runs")

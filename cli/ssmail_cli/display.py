@@ -76,13 +76,17 @@ def write_json(value: Any, out: Path | None) -> None:
 
 
 def short(value: Any, digits: int = 4) -> str:
-    """A value as a table shows it: so many significant digits, month to minute of UTC, a dash for nothing."""
+    """A value as a table shows it: so many significant digits, month to minute of UTC, a dash for nothing; or a list
+    of such.
+    """
     if value is None or value == "":
         return "-"
     if isinstance(value, float):
         return f"{value:.{digits}g}"
     if isinstance(value, datetime):
         return f"{value:%m-%d %H:%M}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(short(item, digits) for item in value)}]"
     return str(value)
 
 

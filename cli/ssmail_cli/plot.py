@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.figures import FigureRecord
+    from ssmail.figures import FigureModule, FigureRecord
     from ssmail.store import RunRow, Store
 
 SKELETON = "skeleton"
@@ -30,7 +30,8 @@ def plot(
         list[str],
         typer.Argument(
             metavar="FIGURE...",
-            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig9 (yjunction), training, skeleton.",
+            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig7 (noise), fig8 (alpha), "
+            "fig9 (yjunction), training, skeleton.",
         ),
     ],
     out: OutDir = DEFAULT_OUT,
@@ -49,7 +50,7 @@ def plot(
         str | None,
         typer.Option(
             "--stat",
-            help="Centre and band of fig3, fig4, fig6 and training: mean-std, median-iqr or mean-ci.",
+            help="Centre and band of fig3, fig4, fig6, fig7, fig8 and training: mean-std, median-iqr or mean-ci.",
             show_default="mean-std",
         ),
     ] = None,
@@ -60,7 +61,10 @@ def plot(
     methods: Annotated[
         list[str] | None, typer.Option("--method", help="training: only runs of this method; repeatable.")
     ] = None,
-    environment: Annotated[str | None, typer.Option("--env", help="training: only runs on this environment.")] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option("--env", help="training, fig8: runs on this environment.", show_default="any; of fig8 mocap"),
+    ] = None,
     group_by: Annotated[
         str | None,
         typer.Option(
@@ -95,10 +99,12 @@ def plot(
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
     _check_figures(figures)
     check_formats(formats or [])
-    training = {"--metric": metrics, "--method": methods, "--env": environment, "--group-by": group_by}
+    training = {"--metric": metrics, "--method": methods, "--group-by": group_by}
     skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
-    _check_owner(TRAINING, training, figures)
-    _check_owner(SKELETON, skeleton, figures)
+    _check_owner([TRAINING], training, figures)
+    _check_owner([SKELETON], skeleton, figures)
+    of_any = [key for key, module in FIGURES.items() if module.has_environment]
+    _check_owner([TRAINING, *of_any], {"--env": environment}, figures)
     if ids and profile and figures != [TRAINING]:
         raise InputError("--runs names the runs already; leave --profile out.")
     statistic = parse_statistic(stat, figures)
@@ -114,8 +120,9 @@ def plot(
             usual = list(dict.fromkeys(shown_on(run.environment).curve for run in chosen))
             _draw_training(chosen, store, metrics or usual, group_by, statistic, out, formats)
         else:
-            record = FIGURES[name].collect(store, ids, profile=profile, statistic=statistic)
-            _save(name, FIGURES[name].stem, record, FIGURES[name].draw(record), out, formats)
+            module = FIGURES[name]
+            record = module.collect(store, ids, profile=profile, statistic=statistic, environment=environment)
+            _save(name, _stem(module, environment), record, module.draw(record), out, formats)
 
 
 def _check_figures(figures: Sequence[str]) -> None:
@@ -128,12 +135,22 @@ def _check_figures(figures: Sequence[str]) -> None:
             raise unknown_name("figure", name, [*FIGURES, TRAINING, SKELETON])
 
 
-def _check_owner(owner: str, options: Mapping[str, object], figures: Sequence[str]) -> None:
-    """Refuse the options of one figure beside others that know nothing of them."""
+def _check_owner(owners: Sequence[str], options: Mapping[str, object], figures: Sequence[str]) -> None:
+    """Refuse the options of some figures beside others that know nothing of them."""
     given = [option for option, value in options.items() if value is not None]
-    others = [name for name in figures if name != owner]
+    others = [name for name in figures if name not in owners]
     if given and others:
-        raise InputError(f"{given[0]} belongs to `ssmail plot {owner}`; draw {', '.join(others)} without it.")
+        names = " and ".join(f"`ssmail plot {owner}`" for owner in owners[:2])
+        raise InputError(f"{given[0]} belongs to {names}; draw {', '.join(others)} without it.")
+
+
+def _stem(module: "FigureModule", environment: str | None) -> str:
+    """The files' name without ending; of another environment than the paper's it names that."""
+    from ssmail.experiments import figure_requirements
+
+    if environment in (None, figure_requirements(module.name).environment):
+        return module.stem
+    return f"{module.stem}_{environment}"
 
 
 def _chosen(

@@ -43,7 +43,7 @@ class Ablation(NamedTuple):
     method: str
     environment: str
     key: str  # dotted, as curriculum.beta
-    values: tuple[Any, ...]
+    values: tuple[Any, ...]  # see `frozen`
 
 
 class FigureRequirements(NamedTuple):
@@ -81,9 +81,12 @@ def build_spec(
     return _assemble(experiments, layers, method, environment, profile)
 
 
-def ablation(name: str, file: Path | None = None) -> Ablation:
-    """The ablation `name` ("beta") of experiments.yaml. Raises InputError for an unknown or incomplete one."""
-    return _ablation(load_experiments(file), name)
+def ablation(name: str, environment: str | None = None, file: Path | None = None) -> Ablation:
+    """The ablation `name` ("beta") of experiments.yaml, on its own environment or another one.
+
+    Raises InputError for an unknown or incomplete one, and for an environment without the section of its key.
+    """
+    return _ablation(load_experiments(file), name, environment)
 
 
 def ablation_specs(
@@ -92,20 +95,23 @@ def ablation_specs(
     values: Sequence[Any] | None = None,
     overrides: Sequence[str] = (),
     file: Path | None = None,
+    environment: str | None = None,
 ) -> dict[Any, RunSpec]:
     """The spec for each of `values` (else the ablation's own), by the value as the spec holds it, each value once.
 
-    Layers: those of build_spec's method, environment and profile, the ablation's settings, the profile's settings for
-    it, the overrides, the value. Raises InputError as build_spec does (a wrong value is "in --values" or in the file),
-    and for an override of the ablated key.
+    Layers: those of build_spec's method, environment (the ablation's own unless one is given) and profile, the
+    ablation's settings, the profile's settings for it, the overrides, the value. Raises InputError as build_spec does
+    (a wrong value is "in --values" or in the file), and for an override of the ablated key.
     """
-    return _ablation_specs(load_experiments(file), name, profile, values, overrides)
+    experiments = load_experiments(file)
+    return _ablation_specs(experiments, _ablation(experiments, name, environment), profile, values, overrides)
 
 
 def ablation_hashes(name: str, file: Path | None = None) -> list[str]:
     """The hashes of the ablation's specs in every profile."""
     experiments = load_experiments(file)
-    found = (_ablation_specs(experiments, name, profile, None, ()) for profile in experiments.profiles)
+    wanted = _ablation(experiments, name)
+    found = (_ablation_specs(experiments, wanted, profile, None, ()) for profile in experiments.profiles)
     return [spec.hash() for specs in found for spec in specs.values()]
 
 
@@ -130,6 +136,18 @@ def spec_value(spec: RunSpec, key: str) -> Any:
     for part in key.split("."):
         value = getattr(value, part)
     return value
+
+
+def frozen(value: Any) -> Any:
+    """A value as a spec holds it and as a dictionary may have it for a key: lists become tuples."""
+    return tuple(map(frozen, value)) if isinstance(value, list | tuple) else value
+
+
+def as_written(value: Any) -> Any:
+    """The value of a spec as people write it: (0.0, 1.0) -> [0, 1]. One that is no tuple stays as it is."""
+    if not isinstance(value, list | tuple):
+        return value
+    return [int(part) if isinstance(part, float) and part.is_integer() else as_written(part) for part in value]
 
 
 def load_experiments(file: Path | None = None) -> Experiments:
@@ -222,7 +240,7 @@ def _file_layers(experiments: Experiments, method: str, environment: str, profil
     ]
 
 
-def _ablation(experiments: Experiments, name: str) -> Ablation:
+def _ablation(experiments: Experiments, name: str, environment: str | None = None) -> Ablation:
     entry = _named(experiments.ablations, "ablation", name)
     source = f"ablations.{name} of {experiments.path.name}"
     choices = (*Ablation._fields[1:], "settings")
@@ -232,20 +250,22 @@ def _ablation(experiments: Experiments, name: str) -> Ablation:
     for key in Ablation._fields[1:]:
         if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
             raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
-    check_section(entry["key"], entry["method"], entry["environment"], source)
-    return Ablation(name, entry["method"], entry["environment"], entry["key"], tuple(entry["values"]))
+    where = environment or entry["environment"]
+    _named(experiments.environments, "environment", where)
+    check_section(entry["key"], entry["method"], where, source)
+    return Ablation(name, entry["method"], where, entry["key"], frozen(entry["values"]))
 
 
 def _ablation_specs(
-    experiments: Experiments, name: str, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
+    experiments: Experiments, found: Ablation, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
 ) -> dict[Any, RunSpec]:
-    found = _ablation(experiments, name)
     layers = _file_layers(experiments, found.method, found.environment, profile)
-    layers += _ablation_layers(experiments, name, profile)
+    layers += _ablation_layers(experiments, found.name, profile)
     given = _override_layers(overrides, found.method, found.environment, "--set")
     if any(found.key in dict(leaves(layer.values)) for layer in given):
-        raise InputError(f"{found.key} is what the ablation {name} varies; give its values with --values, not --set.")
-    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
+        what = f"{found.key} is what the ablation {found.name} varies"
+        raise InputError(f"{what}; give its values with --values, not --set.")
+    source = f"ablations.{found.name} of {experiments.path.name}" if values is None else "--values"
     specs: dict[Any, RunSpec] = {}
     for value in found.values if values is None else values:
         varied = _Layer(source, _nested(found.key, value))

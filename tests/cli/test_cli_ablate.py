@@ -1,5 +1,6 @@
 """`ssmail ablate`: the grid of values and seeds, its names, its plan, and what a second call still computes."""
 
+import contextlib
 import json
 import sys
 from collections.abc import Callable
@@ -7,7 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given as drawn
+from hypothesis import settings
+from hypothesis import strategies as st
 
+from ssmail.errors import InputError
 from ssmail.execution.local import Resume
 from ssmail.experiments import ablation, ablation_specs, load_experiments
 from ssmail.store import Store
@@ -20,7 +25,15 @@ SMOKE = ("ablate", "beta", "--profile", "smoke", "--device", "cpu")
 
 @pytest.mark.parametrize(
     ("text", "values"),
-    [("0,0.1,0.15", [0, 0.1, 0.15]), ("1e-2", [0.01]), (" 1 , 2", [1, 2]), ("a,b-c", ["a", "b-c"])],
+    [
+        ("0,0.1,0.15", [0, 0.1, 0.15]),
+        ("1e-2", [0.01]),
+        (" 1 , 2", [1, 2]),
+        ("a,b-c", ["a", "b-c"]),
+        ("[0,1]", [[0, 1]]),
+        ("[0,1],[-1,1],[[-1,0,1],[0,1,3]]", [[0, 1], [-1, 1], [[-1, 0, 1], [0, 1, 3]]]),
+        ("[0,1] # of the paper", [[0, 1]]),
+    ],
 )
 def test_values(text: str, values: list[Any]) -> None:
     assert parse_values(text) == values
@@ -73,6 +86,45 @@ def test_a_last_part_that_says_little_is_not_used_alone(cli: CommandLine, db: Pa
     assert [row["curriculum.name"] for row in outcome.rows] == list(ablation("curriculum").values)
 
 
+@pytest.mark.parametrize(
+    "text", ["", " ", ",", "0,,1", "0,", ",0", "~,1", "[", "]", "[0,1],[1", "0],[1", "0] # [", "[] , [", "{a", "\t'"]
+)
+def test_values_that_are_none(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--values takes values with commas between them, such as 0,0\.15,1, not "):
+        parse_values(text)
+
+
+@settings(max_examples=50)
+@drawn(st.text("[]{},:#'\"|>&*!~-0a \n", max_size=12))
+def test_any_text_is_values_or_a_sentence(text: str) -> None:
+    with contextlib.suppress(InputError):
+        assert parse_values(text)
+
+
+def test_ranges_are_shown_as_they_are_written(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
+    options = ("--profile", "smoke", "--seeds", "0", "--device", "cpu", "--db", db)
+    ranges = ("--values", "[0,1],[-1,1],[[-1,0,1],[0,1.5,3]]")
+    assert [row["alpha"] for row in cli("ablate-alpha", *options, "--dry-run").rows] == ["[0, 1]", "[-1, 1]"]
+    told = json.loads(cli("ablate", "alpha", *ranges, *options, "--dry-run", "--json").out)
+    assert [row["alpha"] for row in told] == [[0, 1], [-1, 1], [[-1, 0, 1], [0, 1.5, 3]]]
+    fake()
+    outcome = cli("ablate", "alpha", *ranges, *options)
+    assert outcome.code == 0
+    assert [row["alpha"] for row in outcome.rows] == ["[0, 1]", "[-1, 1]", "[[-1, 0, 1], [0, 1.5, 3]]"]
+    assert outcome.err.startswith("alpha [0, 1], seed 0: started (run ")
+
+
+def test_another_environment(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
+    options = ("--profile", "smoke", "--seeds", "0", "--device", "cpu", "--db", db)
+    given = fake()
+    cli("ablate", "alpha", *options)
+    assert [cell.spec.environment for cell in given["cells"]] == ["mocap"] * 2
+    cli("ablate", "alpha", "--env", "yjunction", *options)
+    assert [(cell.spec.environment, cell.spec) for cell in given["cells"]] == [
+        ("yjunction", spec) for spec in ablation_specs("alpha", "smoke", environment="yjunction").values()
+    ]
+
+
 def test_an_ablation_of_ones_own(cli: CommandLine, tmp_path: Path, db: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = load_experiments().path.read_text()
     mine = "  size: {method: ssail, environment: yjunction, key: model.hidden, values: [4, 8]}\n"
@@ -118,6 +170,18 @@ def test_on_a_terminal_the_figure_is_named(
     assert f"`ssmail plot fig6 --db {db}` draws these runs" in cli(*options).err
     fake({0: "interrupted"})
     assert "ssmail plot" not in cli(*options).err
+
+
+def test_of_another_environment_only_a_figure_that_draws_it_is_named(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    options = ("--profile", "smoke", "--seeds", "0", "--device", "cpu", "--db", db)
+    assert f"`ssmail plot fig8 --db {db}` draws these runs" in cli("ablate", "alpha", *options).err
+    elsewhere = cli("ablate", "alpha", "--env", "yjunction", *options)
+    assert f"`ssmail plot fig8 --env yjunction --db {db}` draws these runs" in elsewhere.err
+    assert "ssmail plot" not in cli("ablate", "beta", "--env", "mocap", "--values", "0.5", *options).err
 
 
 def test_a_second_call_computes_only_what_is_missing(

@@ -170,6 +170,16 @@ def test_training_curves_of_each_environment(cli: CommandLine, db: Path, tmp_pat
     [
         ("fig4 --metric train/mode_mse", "--metric belongs to `ssmail plot training`; draw fig4 without it."),
         ("training fig4 --group-by seed", "--group-by belongs to `ssmail plot training`; draw fig4 without it."),
+        (
+            "fig8 fig4 --env yjunction",
+            "--env belongs to `ssmail plot training` and `ssmail plot fig8`; draw fig4 without it.",
+        ),
+        ("fig8 --env yjunctoin", "unknown environment 'yjunctoin'; did you mean yjunction?"),
+        (
+            "fig8 --env yjunction --profile quick",
+            "run `ssmail ablate alpha --env yjunction --profile quick --seeds 0-4`.",
+        ),
+        ("fig8", "no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
         ("fig9 --stat mean-ci", "fig9 shows no centre and band; leave --stat out."),
         ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
         ("fig10", "unknown figure 'fig10'; did you mean fig"),

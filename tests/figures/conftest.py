@@ -10,7 +10,7 @@ from ssmail.experiments import ablation_specs, build_spec
 from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store
 
-from .handmade_arrays import arrays
+from .handmade_arrays import arrays, forecasts
 
 AddRun = Callable[..., str]
 
@@ -51,6 +51,63 @@ def add_run(store: Store) -> AddRun:
         return writer.run_id
 
     return add
+
+
+@pytest.fixture
+def add_forecast(add_run: AddRun) -> AddRun:
+    """add_forecast(seed, level, method="ssail", state, overrides, slope, steps) -> id of a mocap run of profile smoke;
+    a finished one has handmade_arrays.forecasts, or the errors given as `errors`.
+    """
+
+    def add(
+        seed: int = 0,
+        level: float = 0.001,
+        method: str = "ssail",
+        state: RunState = RunState.FINISHED,
+        *,
+        overrides: Sequence[str] = (),
+        errors: Mapping[str, np.ndarray] | None = None,
+        **shape: Any,
+    ) -> str:
+        spec = build_spec(method, "mocap", "smoke", overrides)
+        found = {**forecasts(level, **shape), **(errors or {})}
+        return add_run(seed, [1.0], state, spec=spec, **found)
+
+    return add
+
+
+@pytest.fixture
+def vary_alpha(add_run: AddRun) -> AddRun:
+    """vary_alpha({range: [errors of seeds 0, 1, ...]}, environment="mocap") -> {range: run ids}, in profile smoke.
+
+    An error is that of the last epoch of three; None is a run that diverged in its second epoch. The terms of the
+    discriminator's loss are, seed by seed, 0.3 and 0.2 + seed / 10, then 0.2 and 0.1 + seed / 10, and once more. A
+    finished run has handmade_arrays.forecasts too.
+    """
+
+    def add(
+        results: Mapping[Any, Sequence[float | None]], environment: str = "mocap", overrides: Sequence[str] = ()
+    ) -> dict[Any, list[str]]:
+        specs = ablation_specs("alpha", "smoke", list(results), overrides, environment=environment)
+        return {
+            value: [_with_alpha(add_run, specs[value], seed, error) for seed, error in enumerate(errors)]
+            for value, errors in results.items()
+        }
+
+    return add
+
+
+def _with_alpha(add_run: AddRun, spec: RunSpec, seed: int, error: float | None) -> str:
+    errors = [0.04] if error is None else [0.04, 0.02, error]
+    epochs = {
+        "train/mse": errors,
+        "discriminator/generated": [0.3, 0.2, 0.2],
+        "discriminator/expert": [0.2 + seed / 10, 0.1 + seed / 10, 0.1 + seed / 10],
+        "discriminator/self_supervised": [9.0, 9.0, 9.0],
+    }
+    state = RunState.DIVERGED if error is None else RunState.FINISHED
+    final = {"test_constant_velocity/mse": 0.0025}
+    return add_run(seed, errors, state, spec=spec, epochs=epochs, final=final, **forecasts(errors[-1]))
 
 
 @pytest.fixture

@@ -12,6 +12,20 @@ def lanes() -> np.ndarray:
     return np.stack([np.stack([x, sign * y], axis=-1) for sign in (1, -1)]).astype(np.float32)
 
 
+def forecasts(level: float, slope: float = 0.5, steps: int = STEPS) -> dict[str, np.ndarray]:
+    """What a finished mocap run stores of its error per predicted step: level * (1 + slope * step) and, with noise,
+    three times as much. Of constant velocity it is 0.001 * step, and with noise 0.002 * step.
+    """
+    step = np.arange(1.0, steps + 1)
+    clean = level * (1 + slope * step)
+    return {
+        "test/mse": clean,
+        "test_noisy/mse": 3 * clean,
+        "test_constant_velocity/mse": 0.001 * step,
+        "test_constant_velocity_noisy/mse": 0.002 * step,
+    }
+
+
 def arrays(shift: float = 0.0) -> dict[str, np.ndarray]:
     """What a finished run stores. Rollout (s, b) takes lane (s + b) % 2, 0.01 (3 s + b) + shift to the left of it."""
     modes = lanes()

@@ -18,7 +18,7 @@ from ssmail.errors import InputError
 from ssmail.figures import FIGURES, provenance, save
 from ssmail.store import RunState, Store
 
-NAMES = ("fig3", "fig4", "fig5", "fig6", "fig9")
+NAMES = ("fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "fig9")
 FORMATS = {name: provenance.FORMATS if name == "fig4" else ("svg",) for name in NAMES}  # all of each would take minutes
 
 
@@ -31,8 +31,10 @@ def filled(store: Store, add_run: Any) -> Store:
 
 
 @pytest.fixture
-def ablated(filled: Store, ablate: Any) -> Store:
-    """With runs for figures 3 and 6 too."""
+def whole(filled: Store, ablate: Any, add_forecast: Any, vary_alpha: Any) -> Store:
+    """With runs for the other figures too."""
+    vary_alpha({(0, 1): [0.01, None], (-1, 1): [0.003, 0.002]})
+    add_forecast(0, 0.001, "dnri")
     ablate("curriculum", {"teacher-forcing": [0.04, 0.03], "trajectory-forcing": [0.02, None]})
     return filled
 
@@ -43,9 +45,9 @@ def saved(store: Store, name: str, outdir: Path, formats: Sequence[str] = proven
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_format_gives_its_provenance_back(ablated: Store, tmp_path: Path, name: str) -> None:
-    expected = FIGURES[name].collect(ablated).provenance
-    *images, csv = saved(ablated, name, tmp_path, FORMATS[name])
+def test_each_format_gives_its_provenance_back(whole: Store, tmp_path: Path, name: str) -> None:
+    expected = FIGURES[name].collect(whole).provenance
+    *images, csv = saved(whole, name, tmp_path, FORMATS[name])
     stem = FIGURES[name].stem
     assert [path.name for path in images] == [f"{stem}.{format}" for format in FORMATS[name]]
     assert csv.name == f"{stem}.csv"
@@ -104,12 +106,12 @@ assert "matplotlib.pyplot" not in sys.modules, "a figure must not touch pyplot's
 """
 
 
-def test_equal_runs_give_equal_bytes_in_any_process(ablated: Store, tmp_path: Path) -> None:
-    here = [path for name in NAMES for path in saved(ablated, name, tmp_path / "here", FORMATS[name])]
+def test_equal_runs_give_equal_bytes_in_any_process(whole: Store, tmp_path: Path) -> None:
+    here = [path for name in NAMES for path in saved(whole, name, tmp_path / "here", FORMATS[name])]
     environment = {**os.environ, "PYTHONHASHSEED": "7", "TZ": "Asia/Tokyo", "SOURCE_DATE_EPOCH": "1"}
-    command = [sys.executable, "-c", DRAW, ablated.url, str(tmp_path / "there"), json.dumps(FORMATS)]
+    command = [sys.executable, "-c", DRAW, whole.url, str(tmp_path / "there"), json.dumps(FORMATS)]
     subprocess.run(command, env=environment, check=True)
-    assert len(here) == 4 + 2 * 4
+    assert len(here) == 4 + 2 * (len(NAMES) - 1)
     for path in here:
         assert path.read_bytes() == (tmp_path / "there" / path.name).read_bytes(), path.name
 

@@ -20,6 +20,10 @@ def test_names_and_aliases_lead_to_the_same_figure() -> None:
         "modes": "fig5",
         "fig6": "fig6",
         "beta": "fig6",
+        "fig7": "fig7",
+        "noise": "fig7",
+        "fig8": "fig8",
+        "alpha": "fig8",
         "fig9": "fig9",
         "yjunction": "fig9",
     }

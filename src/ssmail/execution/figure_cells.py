@@ -5,7 +5,7 @@ from statistics import median
 from typing import Any
 
 from ssmail.execution.cells import Cell
-from ssmail.experiments import ablation, ablation_specs, build_spec, figure_requirements
+from ssmail.experiments import ablation, ablation_specs, as_written, build_spec, figure_requirements
 from ssmail.spec import RunSpec
 from ssmail.store import RunRow
 
@@ -23,7 +23,7 @@ def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> dict[Cell, 
     else:
         varied = ablation(needed.ablation)
         for value, spec in ablation_specs(varied.name, profile).items():
-            specs.append((spec, {"method": varied.method, varied.key: value}))
+            specs.append((spec, {"method": varied.method, varied.key: as_written(value)}))
     return {Cell(spec, seed): {**names, "seed": seed} for spec, names in specs for seed in seeds}
 
 

@@ -54,6 +54,7 @@ class FigureModule:
     alias: str
     summary: str
     has_statistic: bool = False  # whether it shows a centre and spread, of one's choice
+    has_environment: bool = False  # whether it can be drawn of another environment than its own
 
     @property
     def stem(self) -> str:
@@ -67,13 +68,18 @@ class FigureModule:
         *,
         profile: str | None = None,
         statistic: "Statistic | None" = None,
+        environment: str | None = None,
     ) -> FigureRecord:
         """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs, of `profile`.
 
-        `statistic` is for figures that have one, mean-std by default. Raises NoRuns when there is nothing to draw,
-        InputError for an unknown or unfit id.
+        `statistic`, mean-std by default, and `environment`, the paper's by default, are for figures that have one, and
+        of no effect on others. Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
         """
-        options = {"statistic": statistic} if self.has_statistic and statistic is not None else {}
+        options: dict[str, Any] = {}
+        if self.has_statistic and statistic is not None:
+            options["statistic"] = statistic
+        if self.has_environment and environment is not None:
+            options["environment"] = environment
         return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
 
     def draw(self, record: FigureRecord) -> "Figure":
@@ -89,6 +95,10 @@ _MODULES = (
     FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
     FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", has_statistic=True),
+    FigureModule("fig7", "noise", "mocap: test error against the predicted step, clean and noisy", has_statistic=True),
+    FigureModule(
+        "fig8", "alpha", "mocap: training over epochs for ranges of alpha", has_statistic=True, has_environment=True
+    ),
     FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
 )
 

@@ -12,7 +12,7 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from ssmail.errors import InputError
-from ssmail.experiments import Ablation, ablation, ablation_specs, figure_requirements, leaves
+from ssmail.experiments import Ablation, ablation, ablation_specs, as_written, figure_requirements, frozen, leaves
 from ssmail.figures import NoRuns
 from ssmail.figures.selection import SETTLED, Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
 from ssmail.store import RunRow, Store
@@ -36,18 +36,22 @@ class _Family(NamedTuple):
 
 
 def select_ablation(
-    store: Store, figure: str, ids: Sequence[str] | None = None, profile: str | None = None
+    store: Store,
+    figure: str,
+    ids: Sequence[str] | None = None,
+    profile: str | None = None,
+    environment: str | None = None,
 ) -> Selection:
     """The runs that `figure` draws, a group for each value of the ablation's key, in rising or the file's order.
 
-    They are those of `ids`, or the default choice among the stored ones of `profile` (or any). Raises NoRuns when none
-    is stored, InputError when an id is unknown or of another environment, when the given runs differ in more than the
-    key, and when the chosen ones were trained on different data.
+    They are those of `ids`, or the default choice among the stored ones of `profile` (or any), on `environment` (or the
+    ablation's own). Raises NoRuns when none is stored, InputError when an id is unknown or of another environment, when
+    the given runs differ in more than the key, and when the chosen ones were trained on different data.
     """
     name = figure_requirements(figure).ablation
     if name is None:
         raise InputError(f"figures.{figure} of experiments.yaml names no ablation; add one, such as beta.")
-    needed = ablation(name)
+    needed = ablation(name, environment)
     if ids:
         runs = runs_of(store, figure, needed.environment, ids)
         _check_one_family(figure, needed.key, runs)
@@ -60,7 +64,7 @@ def select_ablation(
 
 def value_of(run: RunRow, key: str) -> Any:
     """The value of a dotted key in the run's spec; a mark of its own, equal to nothing else, where there is none."""
-    return dict(leaves(run.spec)).get(key, _ABSENT)
+    return frozen(dict(leaves(run.spec)).get(key, _ABSENT))
 
 
 def _family(store: Store, figure: str, needed: Ablation, profile: str | None) -> _Family:
@@ -89,7 +93,8 @@ def _rest(run: RunRow, key: str) -> str:
 def _is_current(needed: Ablation, run: RunRow) -> bool:
     """Whether experiments.yaml's ablation gives the run's spec; a profile that it does not know is of other times."""
     try:
-        specs = ablation_specs(needed.name, run.profile, values=[value_of(run, needed.key)])
+        value, where = value_of(run, needed.key), needed.environment
+        specs = ablation_specs(needed.name, run.profile, values=[value], environment=where)
     except InputError:
         return False
     return run.spec_hash in {spec.hash() for spec in specs.values()}
@@ -127,11 +132,13 @@ def _groups(
 
 
 def _label(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"{value:g}" if isinstance(value, float) else str(as_written(value))
 
 
 def _command(needed: Ablation, profile: str) -> str:
-    return f"`ssmail ablate {needed.name} --profile {profile} --seeds 0-4`"
+    own = ablation(needed.name).environment
+    where = "" if needed.environment == own else f" --env {needed.environment}"
+    return f"`ssmail ablate {needed.name}{where} --profile {profile} --seeds 0-4`"
 
 
 def _note(needed: Ablation, family: _Family, groups: Sequence[Group]) -> str:

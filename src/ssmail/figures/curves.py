@@ -1,5 +1,7 @@
 """Metrics over epochs: every run of a group as a curve, the group's centre and spread, and how both are drawn.
 
+What a note tells of them is in `ssmail.figures.curve_notes`. Errors over predicted steps are curves of the same kind.
+
 No run is dropped. In an error (see `ssmail.figures.quantities`) a run that diverged counts as infinite from then on,
 wherever it recorded no finite value: the mean is not drawn there, the median goes on while it is finite. In any other
 metric such a value is unknown, as it is in every metric after the end of a run: no centre is drawn there.
@@ -15,12 +17,14 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.figures import style
 from ssmail.figures.quantities import is_error
 from ssmail.figures.selection import Group
 from ssmail.store import RunRow, RunState
 
+CEILING = DIVERGED**2  # squared scaled units: where a scale of errors ends
 COLUMNS = ("kind", "label", "run_id", "seed", "epoch", "value", "low", "high")
 
 Floats = npt.NDArray[np.float64]
@@ -29,7 +33,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One metric of one run over its epochs."""
+    """One metric of one run over its epochs, or one of its errors over predicted steps."""
 
     run_id: str
     seed: int
@@ -200,16 +204,14 @@ def legend_title(statistic: Statistic) -> str:
     return f"line and band: {statistic.words}; thin: single runs"
 
 
-def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = np.inf) -> tuple[float, float]:
+def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = CEILING) -> tuple[float, float]:
     """A logarithmic range for every value of the runs and of `others`; see style.log_limits."""
     return style.log_limits(np.concatenate([*(shown.finite for shown in bands), np.array(others)]), ceiling)
 
 
-def cut_note(bands: Sequence[Band]) -> tuple[str, ...]:
-    """What the reader of a logarithmic scale has to know of its bands, if anything."""
-    cut = [shown.label for shown in bands if shown.is_cut]
-    if not cut:
-        return ()
-    return (
-        f"the band of {'; '.join(cut)} is cut a factor {style.REACH:g} below the lowest run; the CSV has its numbers.",
-    )
+def linear_limits(bands: Sequence[Band]) -> tuple[float, float]:
+    """A range for every value of the runs, with a margin."""
+    values = np.concatenate([shown.finite for shown in bands])
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
+    return low - margin, high + margin

@@ -5,13 +5,12 @@ sampled rollouts from training starts. Every method has a panel, all to one loga
 the thick line and the band are centre and spread over **all** runs of the method (`ssmail.evaluation.statistics`); the
 centres of the other methods are repeated in grey. No run is dropped: a run that diverged ends in a cross at the top
 edge, is counted in the title, and takes the mean with it. The dotted line is the test error of constant velocity: what
-driving straight on costs. The scale ends at CEILING, where every position is as far away as a rollout that counts as
-diverged; what rises above it is told in a note.
+driving straight on costs. The scale ends at `curves.CEILING`, where every position is as far away as a rollout that
+counts as diverged; what rises above it is told in a note.
 
 Deviation: the paper's figure shows mean and standard deviation alone, and its authors discarded runs that failed.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,9 +19,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
-from ssmail.evaluation.metrics import DIVERGED
-from ssmail.evaluation.statistics import LARGEST, Statistic, permutation_test
-from ssmail.figures import curves, style
+from ssmail.evaluation.statistics import Statistic
+from ssmail.figures import curve_notes, curves, style
 from ssmail.figures.constant_velocity import constant_velocity
 from ssmail.figures.curves import Band, band, silent
 from ssmail.figures.provenance import Provenance
@@ -31,7 +29,6 @@ from ssmail.store import Store
 
 NAME = "fig4"
 METRIC = "train/mode_mse"
-CEILING = DIVERGED**2  # squared scaled units
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,36 +74,8 @@ def collect(
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
-        notes=(*selection.notes, *_high_notes(bands), *curves.cut_note(bands), *_comparisons(bands)),
+        notes=(*selection.notes, *curve_notes.high(bands), *curve_notes.cut(bands), *curve_notes.comparisons(bands)),
     )
-
-
-def _high_notes(bands: Sequence[Band]) -> list[str]:
-    counts = {shown.label: sum(_rises(curve) for curve in shown.curves) for shown in bands}
-    return [
-        f"{label}: {n} of the runs rise above {CEILING:g}, where the scale ends." for label, n in counts.items() if n
-    ]
-
-
-def _rises(curve: curves.Curve) -> bool:
-    return bool((np.isfinite(curve.values) & (curve.values > CEILING)).any())
-
-
-def _comparisons(bands: Sequence[Band]) -> list[str]:
-    """The first method against each other one at the end of training, a diverged run being the worst."""
-    notes = []
-    for other in bands[1:]:
-        a, b = (shown.last for shown in (bands[0], other))
-        unfinished, many = np.isnan([*a, *b]).any(), math.comb(len(a) + len(b), len(a)) > LARGEST
-        if unfinished or many:
-            continue  # there is no last epoch, or no enumerating all splits
-        found = permutation_test(a, b, on="ranks")
-        notes.append(
-            f"{bands[0].label} against {other.label} at the last epoch: medians {np.median(a):.3g} and "
-            f"{np.median(b):.3g}, exact two-sided permutation test on ranks p = {found.p:.2g} (least "
-            f"possible {found.least:.2g})."
-        )
-    return notes
 
 
 def draw(record: StabilityRecord) -> Figure:
@@ -116,7 +85,7 @@ def draw(record: StabilityRecord) -> Figure:
         panels = figure.subplots(len(record.bands), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
         others = [] if record.constant_velocity is None else [record.constant_velocity]
         strokes = style.strokes([shown.label for shown in record.bands])
-        style.log_axis(panels[0], curves.limits(record.bands, others, CEILING))
+        style.log_axis(panels[0], curves.limits(record.bands, others))
         handles = []
         for axes, shown in zip(panels, record.bands, strict=True):
             for other in record.bands:

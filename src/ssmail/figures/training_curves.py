@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.experiments import leaves, unknown_name
-from ssmail.figures import curves, style
+from ssmail.figures import curve_notes, curves, style
 from ssmail.figures.curves import Band, band, silent
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.quantities import label, last_part
@@ -100,7 +100,7 @@ def collect(
         drawn |= {run.id: run for group in groups for run in group.runs}
         notes += left_out
         if panels[-1].logarithmic:
-            notes += curves.cut_note(panels[-1].bands)
+            notes += curve_notes.cut(panels[-1].bands)
     return TrainingRecord(
         panels=tuple(panels),
         statistic=statistic,
@@ -216,12 +216,9 @@ def draw(record: TrainingRecord) -> Figure:
 def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> dict[str, Line2D]:
     axes.set_ylabel(label(panel.metric))
     if panel.logarithmic:
-        style.log_axis(axes, curves.limits(panel.bands))
+        style.log_axis(axes, curves.limits(panel.bands, ceiling=np.inf))
     else:
-        values = np.concatenate([shown.finite for shown in panel.bands])
-        low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-        margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-        axes.set_ylim(low - margin, high + margin)
+        axes.set_ylim(curves.linear_limits(panel.bands))
     handles = {}
     for shown in panel.bands:
         handles[shown.label] = curves.draw_band(axes, shown, strokes[shown.label])
