@@ -48,6 +48,12 @@ def test_a_figure_of_an_ablation_needs_each_value_with_each_seed() -> None:
     assert first == {"method": "ssail", "curriculum.beta": 0.0, "seed": 0}
 
 
+def test_ranges_are_named_as_they_are_written() -> None:
+    cells = figure_cells("fig8", "smoke", [0])
+    assert [names["self_supervision.alpha"] for names in cells.values()] == [[0, 1], [-1, 1]]
+    assert {cell.spec.environment for cell in cells} == {"mocap"}
+
+
 def test_figures_share_equal_cells() -> None:
     fig3, fig4, fig5, fig6 = (set(figure_cells(f"fig{number}", "quick", range(5))) for number in (3, 4, 5, 6))
     assert len(fig4 & fig5) == 5  # ssail
