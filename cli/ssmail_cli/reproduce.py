@@ -45,7 +45,7 @@ def reproduce(
         str | None,
         typer.Option(
             "--stat",
-            help="Centre and band of fig3, fig4 and fig6: mean-std, median-iqr or mean-ci.",
+            help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
             show_default="mean-std",
         ),
     ] = None,

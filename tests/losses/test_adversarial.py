@@ -90,7 +90,7 @@ def test_penalty_is_taken_between_generated_and_expert_and_teaches_the_critic() 
         value = gradient_penalty(
             lambda x, a: (c * x.square() / 2).sum(-1) + a.sum(-1), generated, expert, torch.full((1, 1), mix)
         )
-        assert float(value) == pytest.approx(expected, abs=1e-4)
+        assert value.item() == pytest.approx(expected, abs=1e-4)
     (gradient,) = torch.autograd.grad(value, c)  # d/dc (2 c - 1)^2 = 4 (2 c - 1)
     assert float(gradient) == pytest.approx(20.0, rel=1e-4)
 
