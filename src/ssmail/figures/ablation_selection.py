@@ -86,8 +86,9 @@ def _family(store: Store, figure: str, needed: Ablation, profile: str | None) ->
 
 
 def _rest(run: RunRow, key: str) -> str:
-    """The run's spec without the key."""
-    return json.dumps({name: value for name, value in leaves(run.spec) if name != key}, sort_keys=True)
+    """The run's spec without the key, and without nulls, which earlier versions may have had no key for."""
+    values = {name: value for name, value in leaves(run.spec) if name != key and value is not None}
+    return json.dumps(values, sort_keys=True)
 
 
 def _is_current(needed: Ablation, run: RunRow) -> bool:
