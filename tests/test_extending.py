@@ -54,7 +54,7 @@ def test_the_example_trains_and_its_broken_brothers_do_not(home: Path, capsys: p
     assert (run(train), capsys.readouterr().out.splitlines()[1].split(",")[1]) == (0, "new")
     for right, wrong, said in (
         ("(alpha: torch.Tensor)", "(alpha, more)", "cannot be called"),
-        ("2 - alpha", "0 * torch.log(-alpha)", "returns NaN or infinity for alpha 1.0"),
+        ("2 - alpha", "0 * torch.log(-alpha)", "returns NaN or infinity for alpha 1"),
         ("towards = ", "towards = alpha.nothing + ", "raises AttributeError: "),
     ):
         assert right in block("python")

@@ -121,7 +121,7 @@ def test_a_changed_file_is_another_spec(home: Path) -> None:
     with pytest.raises(InputError, match="not the file it was"):
         spec(label)
     (home / "own.py").unlink()
-    with pytest.raises(InputError, match="own:f: there is no module own in .*/home or .*/elsewhere, nor is it"):
+    with pytest.raises(InputError, match=r"own:f: there is no module own in .*/home or .*/elsewhere, nor is it"):
         spec()
     (Path.cwd() / "own.py").write_text("def f(alpha):\n    return alpha\n")
     assert spec() == before  # found in the current folder

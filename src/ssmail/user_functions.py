@@ -50,13 +50,12 @@ def pinned(function: UserFunction, folders: Sequence[Path]) -> str:
 def load(function: UserFunction, folders: Sequence[Path]) -> Callable[..., Any]:
     """Execute the file, afresh each time, and return what it calls `name`.
 
-    The folders become importable (after everything else) and stay so, for the file's own imports. Raises InputError as
-    `pinned` does, when the file cannot be executed, and when it has no function of that name.
+    While it is executed its own imports find the folders too, after everything else. Raises InputError as `pinned`
+    does, when the file cannot be executed, and when it has no function of that name.
     """
     path = _locate(function, folders)
     source = _read(function, path)
-    sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
-    module = _execute(function, path, source)
+    module = _execute(function, path, source, folders)
     found = getattr(module, function.name, None)
     if not callable(found):
         names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
@@ -106,19 +105,21 @@ def _digest(source: bytes) -> str:
     return hashlib.sha256(source.replace(b"\r\n", b"\n")).hexdigest()[:12]
 
 
-def _execute(function: UserFunction, path: Path, source: bytes) -> Any:
+def _execute(function: UserFunction, path: Path, source: bytes, folders: Sequence[Path]) -> Any:
     """A new module of this source, which is what the digest is of; a compiled file of Python's could be another."""
     search = [str(path.parent)] if path.name == "__init__.py" else None
     spec = importlib.util.spec_from_file_location(function.module, path, submodule_search_locations=search)
     assert spec is not None
     module = importlib.util.module_from_spec(spec)
-    before = sys.modules.get(function.module)
+    before, paths = sys.modules.get(function.module), list(sys.path)
     sys.modules[function.module] = module  # dataclasses and relative imports look there
+    sys.path += map(str, folders)
     try:
         exec(compile(source, str(path), "exec"), vars(module))
     except (Exception, SystemExit) as error:
         raise InputError(f"{function}: {path} cannot be imported, {told(error)}; correct it.") from error
     finally:
+        sys.path[:] = paths
         sys.modules.pop(function.module, None)
         if before is not None:
             sys.modules[function.module] = before

@@ -44,7 +44,10 @@ def test_labels_worked_out_by_hand(label: str, labels: list[float]) -> None:
     assert given.dtype == ALPHAS.dtype
 
 
-@given(st.dictionaries(finite, finite, min_size=2, max_size=8), st.lists(finite, min_size=1, max_size=20))
+@given(
+    st.dictionaries(st.integers(-500, 500).map(lambda tenths: tenths / 10), finite, min_size=2, max_size=8),
+    st.lists(finite, min_size=1, max_size=20),
+)
 def test_the_line_through_knots_is_that_of_numpy(knots: dict[float, float], alphas: list[float]) -> None:
     x = sorted(knots)
     y = [knots[alpha] for alpha in x]
@@ -73,11 +76,12 @@ def test_at_a_jump_the_first_label_holds_and_above_it_the_second(jumps: list[tup
         ("[[0,0],[1,0.5]]", "is 0.5 at alpha 1, where Eq. 3 asks D(tau_E) = 1; make it 1."),
         (
             "[[0,0],[0.5,0.8],[0.7,0.2],[1,1]]",
-            "falls to 0.785 at alpha 0.505, which leads the policy away from the expert; let it rise from alpha 0 to 1.",
+            "falls to 0.785 at alpha 0.505, which leads the policy away from the expert; "
+            "let it rise from alpha 0 to 1.",
         ),
         ("[[0,0],[0.001,0.9],[0.002,0.1],[1,1]]", "falls to 0.1 at alpha 0.002, "),  # between two points of the grid
         ("[[-1,1],[0,0],[1,1]]", "is 0.005 at alpha -0.005, which leads the policy backwards; "),
-        ("[[0,0],[0.5,1.0e+300],[1,1]]", "is not finite at alpha 0.5; choose smaller numbers."),
+        ("[[0,0],[0.5,1.0e+300],[1,1]]", "is not finite at alpha "),
     ],
 )
 def test_a_label_that_misleads_is_refused(label: str, said: str) -> None:
@@ -85,9 +89,9 @@ def test_a_label_that_misleads_is_refused(label: str, said: str) -> None:
 
 
 def test_only_where_alpha_is_drawn() -> None:
-    """Each is refused on the whole range, by the test above."""
+    """On the whole range each is refused."""
     checked("[[0,0],[1,0.5]]", "[-1,0.9]")
-    checked("[[-1,0],[0,0.25],[1,1]]", "[[-1,-0.9,1],[0.9,1,1]]")
+    checked("[[-1,-1],[0,0.25],[1,1]]", "[[-1,-0.9,1],[0.9,1,1]]")
     checked("[[0,0],[0.5,0.8],[0.7,0.2],[1,1]]", "[[0,0.5,1],[0.99,1,1]]")
     checked("[[-1,1],[0,0],[1,1]]", "[0,1]")
     checked("identity", "[0.5,0.5]")
@@ -135,7 +139,7 @@ def squeezed(alpha):
     return alpha.squeeze()
 
 def nan_somewhere(alpha):
-    return torch.where((alpha > 0.4) & (alpha < 0.41), torch.nan, alpha)
+    return torch.where((alpha > 0.402) & (alpha < 0.408), torch.nan, alpha)
 
 def infinite(alpha):
     return 1 / alpha

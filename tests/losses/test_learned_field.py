@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ssmail.experiments import build_spec
 from ssmail.losses.adversarial import ssail_loss
-from ssmail.losses.labels import checked_label
+from ssmail.losses.labels import checked_label, label_function
 from ssmail.losses.self_supervision import mix, sample_alpha
 from ssmail.models.discriminator import Discriminator
 from ssmail.spec import used
@@ -22,6 +22,7 @@ STEPS, BATCH, TRANSITIONS = 700, 64, 2
 TOLERANCE = 0.1  # of D along the segment, where labels go from -1 to 1.5
 AROUND_A_JUMP = 0.15  # alphas nearer than this to a jump are left out: D is continuous
 CORNERS = "[[-1,-0.5],[0,0],[0.5,0.75],[1,1],[1.5,0.5]]"
+LABELS = ("identity", "zero-above-one", CORNERS)
 
 
 def trajectory(sideways: float) -> tuple[Tensor, Tensor]:
@@ -71,3 +72,48 @@ def field(network: Discriminator, alpha: Tensor) -> Tensor:
     """(A, T, N): what D says along the segment."""
     with torch.no_grad():
         return network(*mixed(alpha))
+
+
+def deviation(network: Discriminator, label: str, alpha: Tensor) -> Tensor:
+    """(A,) the largest difference of D from the label over transitions and agents."""
+    given = [f"self_supervision.label={label}"]
+    labels = label_function(used(build_spec("ssail", "yjunction", "smoke", given).self_supervision).label)(alpha)
+    return (field(network, alpha) - labels.view(-1, 1, 1)).abs().amax(dim=(1, 2))
+
+
+def along(label: str) -> Tensor:
+    """Alphas from -1 to 1.5, less those around the label's jump."""
+    alpha = torch.linspace(-1, 1.5, 51)
+    return alpha[(alpha - 1).abs() > AROUND_A_JUMP] if label == "zero-above-one" else alpha
+
+
+@pytest.mark.parametrize("label", LABELS)
+def test_the_field_follows_its_label_and_no_other(label: str) -> None:
+    network = trained(label)
+    for other in LABELS:
+        error = float(deviation(network, other, along(label)).max())
+        assert (error < TOLERANCE) is (other == label), f"{error:.3f} from {other}"
+        assert error < TOLERANCE or error > 4 * TOLERANCE
+
+
+def test_the_ends_are_those_of_eq_3_whatever_the_label() -> None:
+    for label in LABELS:
+        expected = torch.tensor([0.0, 1.0]).view(-1, 1, 1).expand(2, TRANSITIONS, 2)
+        given = field(trained(label), torch.tensor([0.0, 1.0]))
+        torch.testing.assert_close(given[:1], expected[:1], atol=TOLERANCE, rtol=0)
+        if label != "zero-above-one":  # whose jump is at the expert
+            torch.testing.assert_close(given[1:], expected[1:], atol=TOLERANCE, rtol=0)
+
+
+def test_only_negative_alphas_constrain_the_field_behind_the_policy() -> None:
+    """Of three seeds, at alpha -1; ahead of the policy both are right."""
+    behind, ahead = torch.tensor([-1.0]), torch.linspace(0, 1, 11)
+    errors = {
+        density: [float(deviation(trained("identity", density, seed), "identity", behind)) for seed in range(3)]
+        for density in ("[0,1]", "[-1,1]")
+    }
+    assert max(errors["[-1,1]"]) < TOLERANCE
+    assert max(errors["[0,1]"]) > 4 * TOLERANCE
+    assert sum(errors["[0,1]"]) > 3 * sum(errors["[-1,1]"])
+    for density in errors:
+        assert float(deviation(trained("identity", density, 0), "identity", ahead).max()) < TOLERANCE

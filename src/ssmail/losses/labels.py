@@ -41,7 +41,7 @@ def piecewise_linear(knots: Knots, alpha: Tensor) -> Tensor:
 
     Two knots at one alpha are a jump: the first holds at that alpha and below, the second above it.
     """
-    x, y = torch.tensor(knots, dtype=torch.float64).T.contiguous()
+    x, y = torch.tensor(knots, dtype=torch.float64, device=alpha.device).T.contiguous()
     at = alpha.double()
     right = torch.searchsorted(x, at).clamp(1, len(x) - 1)  # x[right - 1] < alpha <= x[right], but for the ends
     low, width = x[right - 1], x[right] - x[right - 1]
