@@ -116,6 +116,32 @@ def test_a_whole_number_is_a_float_and_gives_the_same_spec() -> None:
             "self_supervision.alpha=[[0,1,0]]",
             "self_supervision.alpha: the weight 0 of the range from 0 to 1 is not above 0.",
         ),
+        *(
+            (
+                f"self_supervision.label={wrong}",
+                "self_supervision.label: takes identity, zero-above-one, two knots [[alpha, label], ...] or more, or "
+                "module:function.",
+            )
+            for wrong in (
+                "null",
+                "1",
+                "identiy",
+                "a:b:c",
+                "[]",
+                "[[0,0]]",
+                "[[0,0],1]",
+                "[[0,0,0],[1,1,1]]",
+                "[[0,.nan],[1,1]]",
+            )
+        ),
+        (
+            "self_supervision.label=[[0,0],[1,1],[0.5,1]]",
+            "self_supervision.label: the knot at alpha 0.5 comes after the one at 1; sort them.",
+        ),
+        (
+            "self_supervision.label=[[0,0],[1,0],[1,1],[1,2]]",
+            "self_supervision.label: more than two knots at alpha 1; two of them make a jump.",
+        ),
         ("sac=3", "sac = 3 in --set is a section, not a value; set one of its keys such as sac.gamma."),
         ("method=gail", "'method' in --set cannot be set there; give it with --method."),
         ("environment=x", "'environment' in --set cannot be set there; give it with --env."),

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    ("errors", "spec", "spec_keys", "strict_yaml"),
+    ("errors", "shaping", "spec", "spec_keys", "strict_yaml", "user_functions"),
     ("experiments",),
     ("data", "envs"),
     ("models",),

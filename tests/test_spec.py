@@ -1,11 +1,18 @@
 """What a spec holds in each environment, and what it is known by."""
 
+import contextlib
+import hashlib
+import json
+
 import pytest
+from hypothesis import given as given_by
+from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from ssmail import spec as specs
 from ssmail.errors import InputError
 from ssmail.experiments import build_spec
+from ssmail.shaping import read_label
 from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
 
 
@@ -78,6 +85,57 @@ def test_a_field_or_section_that_is_added_as_null_leaves_the_hash_as_it_was(envi
     assert Later.model_validate(values).as_json() != now.as_json()
     values["adversarial"]["later"] = 0
     assert Later.model_validate(values).hash() != now.hash()
+
+
+def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
+    """They had the identity without a name for it."""
+    now = build_spec("ssail", "yjunction", "smoke")
+    values = now.model_dump(mode="json", exclude_none=True)
+    assert values["self_supervision"].pop("label") == "identity"
+    before = json.dumps(values, sort_keys=True, separators=(",", ":"))
+    assert now.hash() == hashlib.sha256(before.encode()).hexdigest()[:16]
+    assert '"label":"identity"' in now.as_json()
+    assert specs.completed(values)["self_supervision"]["label"] == "identity"
+    other = build_spec("ssail", "yjunction", "smoke", ["self_supervision.label=zero-above-one"])
+    assert other.hash() != build_spec("ssail", "yjunction", "smoke").hash()
+    assert specs.completed(other.model_dump())["self_supervision"]["label"] == "zero-above-one"
+    assert specs.completed({"self_supervision": None}) == {"self_supervision": None}
+
+
+@pytest.mark.parametrize(
+    ("given", "label"),
+    [
+        ("identity", "identity"),
+        ("zero-above-one", "zero-above-one"),
+        ("[[0,0],[1,1]]", ((0.0, 0.0), (1.0, 1.0))),
+        ("[[-1,-1],[1,1],[1,0]]", ((-1.0, -1.0), (1.0, 1.0), (1.0, 0.0))),
+    ],
+)
+def test_a_label_is_a_word_or_knots(given: str, label: object) -> None:
+    made = build_spec("ssail", "yjunction", "smoke", [f"self_supervision.label={given}"])
+    assert made.self_supervision is not None
+    assert made.self_supervision.label == label
+    assert RunSpec.model_validate_json(made.as_json()) == made
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given_by(st.lists(st.tuples(finite, finite), min_size=2, unique_by=lambda knot: knot[0]))
+def test_knots_have_to_rise(knots: list[tuple[float, float]]) -> None:
+    rising = sorted(knots)
+    assert read_label([list(knot) for knot in rising]) == tuple(rising)
+    if knots != rising:
+        with pytest.raises(ValueError, match="sort them"):
+            read_label(knots)
+
+
+@given_by(st.recursive(st.none() | st.booleans() | st.floats() | st.text(max_size=9), st.lists, max_leaves=9))
+def test_anything_else_is_no_label(value: object) -> None:
+    with contextlib.suppress(ValueError):
+        found = read_label(value)
+        assert isinstance(found, str | tuple)
+        assert read_label(found) == found
 
 
 def test_a_null_and_a_value_are_different_specs() -> None:

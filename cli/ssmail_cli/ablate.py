@@ -19,13 +19,13 @@ from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_
 
 def ablate(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="alpha, beta or curriculum, or one of your experiments.yaml.")
+        str, typer.Argument(metavar="NAME", help="alpha, beta, curriculum or label, or one of your experiments.yaml.")
     ],
     values: Annotated[
         str | None,
         typer.Option(
             "--values",
-            help="The values, as 0,0.1,0.15 or [0,1],[-1,1]; each once.",
+            help="The values, as 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once.",
             show_default="those of experiments.yaml",
         ),
     ] = None,

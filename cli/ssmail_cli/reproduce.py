@@ -56,6 +56,7 @@ def reproduce(
     Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed. A run that fails stops
     neither the others nor the figures. Prints the paths of the files.
     """
+    from ssmail.execution.cells import check_labels
     from ssmail.execution.figure_cells import longest_first
     from ssmail.store import Store
 
@@ -70,6 +71,7 @@ def reproduce(
         return
     sweep = {cell: needed[cell] for cell in longest_first(list(needed), seconds)}
     chosen_device = pick_device(device)
+    check_labels(sweep)
     store = Store.open(db)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, ResumeChoice.AUTO, chosen_device))
     drawn = is_interrupted(rows) or _draw(store, figures, sweep, rows, statistic, out, formats or ["png"])

@@ -27,8 +27,10 @@ Rows = list[dict[str, Any]]
 
 def train_sweep(sweep: Sweep, db: str, jobs: int, resume: ResumeChoice, device: str, as_json: bool) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
+    from ssmail.execution.cells import check_labels
     from ssmail.store import Store
 
+    check_labels(sweep)  # before there is a database
     store = Store.open(db)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
     print_rows(rows, {**_heading(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
@@ -87,9 +89,10 @@ def print_plan(sweep: Sweep, db: str, resume: ResumeChoice, as_json: bool) -> No
 
 def plan(sweep: Sweep, db: str, resume: ResumeChoice) -> "dict[Cell, tuple[str, str | None]]":
     """For each cell "new", "skip" or "resume", and the id of the run that there is; no database is made."""
-    from ssmail.execution.cells import Resume, Settings, plan_cell
+    from ssmail.execution.cells import Resume, Settings, check_labels, plan_cell
     from ssmail.store import Store
 
+    check_labels(sweep)
     if is_missing(db):
         if resume is ResumeChoice.REQUIRE:
             raise InputError(f"there is no database {db}, so nothing to resume; use --resume auto.")

@@ -7,6 +7,7 @@ The specs of an ablation have its `settings`, and then the profile's `ablations:
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,9 +19,11 @@ from ssmail import strict_yaml
 from ssmail.errors import InputError
 from ssmail.spec import ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
 from ssmail.spec_keys import check_keys, check_section, nearest, sentence
+from ssmail.user_functions import UserFunction, pinned
 
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
 _FILE_NAME = "experiments.yaml"
+_LABEL = ("self_supervision", "label")
 Mappings = Mapping[str, Mapping[str, Any]]
 
 
@@ -170,6 +173,11 @@ def load_experiments(file: Path | None = None) -> Experiments:
     return Experiments(path=path, **content)
 
 
+def function_folders(file: Path | None = None) -> tuple[Path, ...]:
+    """Where a user's own functions are looked for: the folder of the experiments.yaml in use, the current folder."""
+    return tuple(dict.fromkeys(((file or _find_file()).resolve().parent, Path.cwd())))
+
+
 def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """(dotted key, value) of every value that is not a mapping with keys."""
     for key, value in values.items():
@@ -208,10 +216,19 @@ def _assemble(
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(sections_of(method, environment)))
         if environment != "yjunction":
             merged["data"] = {**merged.get("data", {}), "yjunction": None}
+    section, key = _LABEL
+    if isinstance(merged.get(section), Mapping) and key in merged[section]:
+        merged = _merge(merged, {section: {key: _pinned(merged[section][key], experiments)}})
     try:
         return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
         raise InputError(sentence(error, origins, experiments.path)) from None
+
+
+def _pinned(label: Any, experiments: Experiments) -> Any:
+    """A label as a spec holds it: the name of a user's own function with the digest of its file, others unchanged."""
+    function = UserFunction.parse(label)
+    return pinned(function, function_folders(experiments.path)) if function else label
 
 
 def _file_layers(experiments: Experiments, method: str, environment: str, profile: str) -> list[_Layer]:
@@ -272,7 +289,11 @@ def _ablation(experiments: Experiments, name: str, environment: str | None = Non
     where = environment or entry["environment"]
     _named(experiments.environments, "environment", where)
     check_section(entry["key"], entry["method"], where, source)
-    return Ablation(name, entry["method"], where, entry["key"], frozen(entry["values"]))
+    values = entry["values"]
+    if entry["key"] == ".".join(_LABEL):
+        with suppress(InputError):  # runs can be drawn without the files of their functions
+            values = [_pinned(value, experiments) for value in values]
+    return Ablation(name, entry["method"], where, entry["key"], frozen(values))
 
 
 def _ablation_specs(

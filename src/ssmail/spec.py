@@ -5,10 +5,12 @@ No field has a default here: each default is written once, in experiments.yaml (
 
 import hashlib
 import json
-import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from ssmail.shaping import AlphaDensity, AlphaPiece, Label
 
 Count = Annotated[int, Field(ge=1)]
 NonNegativeCount = Annotated[int, Field(ge=0)]
@@ -121,40 +123,12 @@ class AdversarialSpec(Frozen):
     reward_limit: Positive | None  # rewards are kept within plus and minus this, after scaling; null: as they are
 
 
-def read_alpha(value: Any) -> Any:
-    """The density of alpha from what a file or the command line gives: a range [low, high] -> (low, high), or weighted
-    ranges [[low, high, weight], ...] -> ((low, high, weight), ...), a piecewise constant density whose weights are
-    relative. Raises ValueError for anything else.
-    """
-    ranges = value if _is_list(value) and value and all(map(_is_list, value)) else [value]
-    numbers = 2 if ranges is not value else 3
-    for part in ranges:
-        if not _is_list(part) or len(part) != numbers or not all(map(_is_number, part)):
-            raise ValueError("takes a range [low, high], or weighted ranges [[low, high, weight], ...]")
-        if part[0] > part[1]:
-            raise ValueError(f"the range from {part[0]:g} to {part[1]:g} ends before it begins; swap them")
-        if numbers == 3 and part[2] <= 0:
-            raise ValueError(f"the weight {part[2]:g} of the range from {part[0]:g} to {part[1]:g} is not above 0")
-    pieces = tuple(tuple(map(float, part)) for part in ranges)
-    return pieces if numbers == 3 else pieces[0]
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, (list, tuple))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-AlphaPiece = tuple[float, float, float]
-AlphaDensity = Annotated[tuple[float, float] | tuple[AlphaPiece, ...], BeforeValidator(read_alpha)]
-
-
 class SelfSupervisionSpec(Frozen):
     """What Eq. 3 adds to the game: tau_alpha, for the discriminator and for the actor-critic (3.1.1, 3.1.3)."""
 
     alpha: AlphaDensity  # what alpha is drawn from: [low, high], or [[low, high, weight], ...]
+    # what D is trained to say of tau_alpha: identity, zero-above-one, [[alpha, label], ...] or module:function
+    label: Label
     pairing: Pairing  # which expert trajectory a generated one is mixed with, in the discriminator's batches
     actor_pairing: Pairing  # the same in the actor-critic's batches
     actor_share: Fraction  # share of tau_alpha in an actor-critic batch; the rest is tau_G
@@ -309,9 +283,14 @@ class RunSpec(Frozen):
 
     def hash(self) -> str:
         """First 16 hexadecimal digits of the SHA-256 of the canonical JSON without nulls; names a cell together with
-        the seed. A section that is added for other methods thus leaves the hash as it was.
+        the seed. A section that is added for other methods thus leaves the hash as it was, and so does a key of LATER
+        with the value that earlier runs had.
         """
-        return hashlib.sha256(_canonical(self.model_dump(mode="json", exclude_none=True)).encode()).hexdigest()[:16]
+        values = self.model_dump(mode="json", exclude_none=True)
+        for section, key, before in LATER:
+            if section in values and values[section][key] == before:
+                del values[section][key]
+        return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:
@@ -324,9 +303,21 @@ def sections_of(method: str, environment: str) -> tuple[str, ...]:
     return (*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
 
 
+def completed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The nested values of a stored spec, with the keys of LATER that it is too old to have."""
+    whole = dict(values)
+    for section, key, before in LATER:
+        if whole.get(section) is not None:
+            whole[section] = {key: before, **whole[section]}
+    return whole
+
+
 def _canonical(values: Any) -> str:
     return json.dumps(values, sort_keys=True, separators=(",", ":"))
 
+
+LATER: tuple[tuple[str, str, Any], ...] = (("self_supervision", "label", "identity"),)
+"""(section, key, value) of what runs of earlier versions had without a name for it."""
 
 OPTIONAL_SECTIONS = tuple(
     dict.fromkeys(

@@ -33,6 +33,7 @@ SMOKE = ("ablate", "beta", "--profile", "smoke", "--device", "cpu")
         ("[0,1]", [[0, 1]]),
         ("[0,1],[-1,1],[[-1,0,1],[0,1,3]]", [[0, 1], [-1, 1], [[-1, 0, 1], [0, 1, 3]]]),
         ("[0,1] # of the paper", [[0, 1]]),
+        ("identity, shaping:steep,[[0,0],[1,1]]", ["identity", "shaping:steep", [[0, 0], [1, 1]]]),
     ],
 )
 def test_values(text: str, values: list[Any]) -> None:
@@ -65,6 +66,26 @@ def test_the_default_is_the_grid_of_experiments_yaml_with_five_seeds(
     found = [(row["beta"], row["seed"]) for row in json.loads(outcome.out)]
     assert found == [(value, seed) for value in ablation("beta").values for seed in range(5)]
     assert not db.parent.exists()
+
+
+def test_labels_are_words_and_knots(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
+    fake()
+    options = ("--profile", "smoke", "--device", "cpu", "--seeds", "0", "--db", db)
+    outcome = cli("ablate", "label", "--values", "identity,[[0,0],[1,1],[1.5,0]]", *options)
+    assert outcome.code == 0
+    assert [row["label"] for row in outcome.rows] == ["identity", "[[0, 0], [1, 1], [1.5, 0]]"]
+
+
+@pytest.mark.parametrize("dry_run", [True, False])
+def test_a_misleading_label_is_refused_before_anything_is_trained(
+    cli: CommandLine, fake: FakeTraining, db: Path, dry_run: bool
+) -> None:
+    given = fake()
+    options = ("--profile", "smoke", "--device", "cpu", "--db", db, *["--dry-run"] * dry_run)
+    refused = cli("ablate", "label", "--values", "identity,[[0,0],[1,0.5]]", *options)
+    assert refused.sentence.startswith("self_supervision.label: the line through the knots is 0.5 at alpha 1, where ")
+    assert not given
+    assert not db.exists()
 
 
 def test_settings_reach_every_value(cli: CommandLine, fake: FakeTraining, db: Path) -> None:

@@ -1,5 +1,7 @@
 """Which family of runs a figure of an ablation draws, and what is said of it."""
 
+import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from ssmail.errors import InputError
 from ssmail.experiments import ablation, ablation_specs, build_spec
 from ssmail.figures import NoRuns
-from ssmail.figures.ablation_selection import select_ablation
+from ssmail.figures.ablation_selection import rest_of, select_ablation, value_of
 from ssmail.store import RunState, Store
 
 OTHER = ["sac.gamma=0.5"]
@@ -25,6 +27,20 @@ def test_the_family_of_experiments_yaml_is_drawn_and_others_are_not(store: Store
     add_run(0, spec=ablation_specs("curriculum", "smoke")["teacher-forcing"])
     add_run(0, method="gail")
     assert chosen(store) == family
+
+
+def test_runs_from_before_a_key_belong_to_the_family(store: Store, add_run: Any) -> None:
+    """They have the identity, as the label that they were trained with is called now; nulls may lack too."""
+    for spec in ablation_specs("label", "smoke", ["identity", "zero-above-one"]).values():
+        add_run(0, spec=spec)
+    identity, zero = store.runs()
+    key, values = "self_supervision.label", json.loads(identity.spec_json)
+    del values["self_supervision"]["label"], values["wasserstein"]
+    old = replace(identity, spec_json=json.dumps(values))
+    assert value_of(old, key) == value_of(identity, key) == "identity"
+    assert rest_of(old, key) == rest_of(identity, key) == rest_of(zero, key)
+    assert rest_of(old, "self_supervision.alpha") == rest_of(identity, "self_supervision.alpha")
+    assert rest_of(zero, "self_supervision.alpha") != rest_of(identity, "self_supervision.alpha")
 
 
 def test_values_of_ones_own_belong_to_it_and_are_in_rising_order(store: Store, ablate: Any) -> None:

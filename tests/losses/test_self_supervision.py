@@ -76,6 +76,24 @@ def test_weighted_ranges_have_their_share_and_are_uniform_inside() -> None:
         assert abs(float(upper.std()) - 0.5 / 12**0.5) < 0.005
 
 
+@pytest.mark.parametrize(
+    ("pieces", "shares"),
+    [
+        ([(-1, 1, 1), (0, 1, 1)], {(-1, 0): 0.25, (0, 0.5): 0.375, (0.5, 1): 0.375}),  # overlapping: densities add up
+        ([(0, 1, 1), (-1, 0, 1)], {(-1, 0): 0.5, (0, 1): 0.5}),  # in any order
+        ([(0, 1, 1), (0, 1, 1)], {(0, 0.5): 0.5, (0.5, 1): 0.5}),  # twice the same
+        ([(0, 1, 3), (0.5, 0.5, 1)], {(0.5, 0.5): 0.25, (0, 1): 1.0}),  # a range without length is one value
+        ([(0, 1, 1e-300), (2, 3, 1e300)], {(2, 3): 1.0}),
+    ],
+)
+def test_mixtures_of_ranges(pieces: list[tuple[float, float, float]], shares: dict[tuple[float, float], float]) -> None:
+    alpha = sample_alpha(40_000, pieces, torch.Generator().manual_seed(0))
+    assert bool(alpha.isfinite().all())
+    for (low, high), share in shares.items():
+        inside = (alpha >= low) & (alpha <= high)
+        assert float(inside.double().mean()) == pytest.approx(share, abs=0.01)
+
+
 def test_one_alpha_for_all_agents_and_steps() -> None:
     generated, expert = torch.randn(4, 7, 3, 2), torch.randn(4, 7, 3, 2)
     alpha = torch.tensor([0.0, 1.0, -1.0, 0.5])

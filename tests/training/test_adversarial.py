@@ -54,6 +54,17 @@ def test_tau_alpha_lies_between_its_pair() -> None:
     torch.testing.assert_close(mixed.actions, (generated.actions + expert.actions) / 2)
 
 
+def test_d_is_trained_on_the_label_of_alpha() -> None:
+    """With every alpha 1.5 and D the constant 0, the self-supervised term is the label's square: 1.5 or 0."""
+    for label, term in (("identity", 2.25), ("zero-above-one", 0.0), ("[[0,0],[1,1],[2,0]]", 0.25)):
+        made, _ = learner("self_supervision.alpha=[1.5,1.5]", f"self_supervision.label={label}")
+        for parameter in list(made.discriminator.head.parameters())[-2:]:
+            torch.nn.init.zeros_(parameter)
+        latest, _ = made.generate(0.0)
+        made.replay.add(latest)
+        assert made._update_discriminator(latest)["discriminator/self_supervised"] == pytest.approx(term)
+
+
 def test_targets_follow_and_only_the_critic_learns_from_its_loss() -> None:
     """After one update the target critic has gone `polyak` of the way, and gradients are on again everywhere."""
     made, _ = learner("sac.polyak=0.25")

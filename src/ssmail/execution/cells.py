@@ -1,7 +1,7 @@
 """What is computed (a cell), what is told of it (events), and what is to be done with it (the plan)."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -111,6 +111,15 @@ class Plan:
 
     skipped: Event | None = None
     row: RunRow | None = None
+
+
+def check_labels(cells: Iterable[Cell]) -> None:
+    """Raise InputError when the label function of any of the cells is broken, before one of them is computed."""
+    for supervision in dict.fromkeys(cell.spec.self_supervision for cell in cells):
+        if supervision is not None and supervision.label != "identity":
+            from ssmail.losses.labels import checked_label  # imported here because a plan must not wait for torch
+
+            checked_label(supervision)
 
 
 def _check_data(cell: Cell, row: RunRow) -> None:

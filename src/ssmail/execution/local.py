@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from ssmail.errors import InputError
-from ssmail.execution.cells import Cell, Event, Job, Kind, Resume, Settings, plan_cell
+from ssmail.execution.cells import Cell, Event, Job, Kind, Resume, Settings, check_labels, plan_cell
 from ssmail.store import HEARTBEAT_SECONDS, STALE_SECONDS, RunState, Store
 
 __all__ = ["Cell", "Event", "Resume", "run_cells"]
@@ -41,9 +41,10 @@ def run_cells(
     `on_event` is called in this process with every event, final ones included. A cell that fails leaves the others
     alone. SIGINT or SIGTERM to this process lets every running cell finish its epoch and marks it interrupted; a second
     one kills them (their epoch is lost, nothing else). Raises InputError, and computes nothing, when another process is
-    computing one of the cells, when there is nothing to resume and `resume` is REQUIRE, or when the first cell cannot
-    begin because of its input.
+    computing one of the cells, when there is nothing to resume and `resume` is REQUIRE, when a label function is
+    broken, or when the first cell cannot begin because of its input.
     """
+    check_labels(cells)
     settings = Settings(device, resume, heartbeat_seconds, stale_seconds, loop_factory)
     store = Store.open(store_url)
     try:

@@ -67,13 +67,19 @@ def value_of(run: RunRow, key: str) -> Any:
     return frozen(dict(leaves(run.spec)).get(key, _ABSENT))
 
 
+def rest_of(run: RunRow, key: str) -> str:
+    """The run's spec without the key, and without nulls, which earlier versions may have had no key for."""
+    values = {name: value for name, value in leaves(run.spec) if name != key and value is not None}
+    return json.dumps(values, sort_keys=True)
+
+
 def _family(store: Store, figure: str, needed: Ablation, profile: str | None) -> _Family:
     stored = store.runs(method=needed.method, environment=needed.environment, profile=profile)
     found: dict[Hashable, list[RunRow]] = {}
     current: dict[Hashable, bool] = {}
     for run in stored:
         if run.state in SETTLED and value_of(run, needed.key) is not _ABSENT:
-            found.setdefault(_rest(run, needed.key), []).append(run)
+            found.setdefault(rest_of(run, needed.key), []).append(run)
     for rest, runs in found.items():
         current[rest] = _is_current(needed, runs[0])
     families = [_Family(tuple(runs), current[rest]) for rest, runs in found.items()]
@@ -83,11 +89,6 @@ def _family(store: Store, figure: str, needed: Ablation, profile: str | None) ->
         where += f" of profile {profile}" if profile else ""
         raise NoRuns(f"{figure} has nothing to draw: {where}; run {_command(needed, profile or 'quick')}.")
     return max(fitting, key=lambda family: family.rank)
-
-
-def _rest(run: RunRow, key: str) -> str:
-    """The run's spec without the key."""
-    return json.dumps({name: value for name, value in leaves(run.spec) if name != key}, sort_keys=True)
 
 
 def _is_current(needed: Ablation, run: RunRow) -> bool:

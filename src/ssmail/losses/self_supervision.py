@@ -1,4 +1,4 @@
-"""tau_alpha: mixing generated and expert trajectories, labelled by alpha (sections 3.1.1 and 3.1.3).
+"""tau_alpha: mixing generated and expert trajectories by alpha (sections 3.1.1, 3.1.3); `labels` has what it is called.
 
 The paper prints tau_alpha = alpha * tau_G + (1 - alpha) * tau_E with label alpha, which contradicts D(tau_G) = 0 and
 D(tau_E) = 1. Here, as in the rest of its text, alpha = 0 is the generated trajectory and alpha = 1 the expert:
@@ -16,15 +16,16 @@ def sample_alpha(batch: int, pieces: Sequence[tuple[float, float, float]], gener
     """(B,) draws: one alpha for all agents and steps of a trajectory.
 
     pieces: (low, high, weight) of the ranges, each drawn from with a probability in proportion to its weight, and
-    uniform inside. The inverse of the distribution function, so that each alpha costs one number of the generator.
+    uniform inside; where ranges overlap their densities add up, and a range without length is one value. The inverse of
+    the distribution function, so that each alpha costs one number of the generator.
     """
-    low, high, weight = torch.tensor(pieces).unbind(dim=1)
+    low, high, weight = torch.tensor(pieces, dtype=torch.float64).unbind(dim=1)
     upto = (weight / weight.sum()).cumsum(dim=0)
-    uniform = torch.rand(batch, generator=generator)
+    uniform = torch.rand(batch, generator=generator).double()
     piece = torch.searchsorted(upto[:-1], uniform, right=True)
     before = (upto - weight / weight.sum())[piece]
     fraction = (uniform - before) * weight.sum() / weight[piece]
-    return low[piece] + (high - low)[piece] * fraction.clamp(0, 1)
+    return (low[piece] + (high - low)[piece] * fraction.clamp(0, 1)).float()
 
 
 def mix(generated: Tensor, expert: Tensor, alpha: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from sqlalchemy import Connection, Select, select
 
 from ssmail.errors import InputError
+from ssmail.spec import completed
 from ssmail.store import arrays, schema
 from ssmail.store.schema import RunState
 
@@ -56,9 +57,8 @@ class RunRow:
 
     @cached_property
     def spec(self) -> dict[str, Any]:
-        """The run's spec as plain nested values."""
-        parsed: dict[str, Any] = json.loads(self.spec_json)
-        return parsed
+        """The run's spec as plain nested values, with what an earlier version had no key for."""
+        return completed(json.loads(self.spec_json))
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.losses.adversarial import Terms, gail_loss, gradient_penalty, ssail_loss, wail_loss
+from ssmail.losses.labels import checked_label
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
@@ -31,8 +32,8 @@ from ssmail.training.updates import clipped_step, mean_of, with_noise
 
 @dataclass(frozen=True)
 class Game:
-    """What makes a method: the discriminator's loss of its outputs on tau_G and tau_E (and on tau_alpha, with alpha),
-    and the reward made of its output.
+    """What makes a method: the discriminator's loss of its outputs on tau_G and tau_E (and on tau_alpha, with its
+    labels), and the reward made of its output.
     """
 
     loss: Callable[..., tuple[Tensor, Terms]]
@@ -56,6 +57,7 @@ class AdversarialLearner:
         self.adversarial, self.training = used(spec.adversarial), used(spec.training)
         self.curriculum = used(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
+        self.label = checked_label(self.supervision) if self.supervision else None
         self.experts, self.generators, self.device = setting.experts, setting.generators, setting.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
         self.features = Features.of(model, self.experts.states)
@@ -130,10 +132,10 @@ class AdversarialLearner:
             parts.append(self.replay.sample(past, self.generators["data"]))
         batches = [Batch.concatenate(parts), self.experts.draw(b, self.generators["data"])]
         labels: tuple[Tensor, ...] = ()
-        if self.supervision:
+        if self.supervision and self.label:
             mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
             batches.append(mixed)
-            labels = (alpha,)
+            labels = (self.label(alpha),)
         everything = Batch.concatenate(batches)
         chosen = self._pick_steps(everything.actions.shape[1])
         states, actions = everything.states[:, :-1], everything.actions[:, chosen]
