@@ -158,7 +158,7 @@ def test_the_actor_waits_for_its_start_while_its_judges_learn() -> None:
 
 
 def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
-    """The same graphs and entropy; the gradient is that of the learned steps, and none is missing without truncation."""
+    """The same graphs and entropy; with as many steps as there are, or null, no gradient is missing."""
     made, loop = learner("model.graph_noise=edge")
     x = made.features(loop.experts.states[:4], loop.experts.states[:4, 0])
     policy, results = made.actor_critic.policy, []
