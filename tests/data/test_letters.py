@@ -104,10 +104,9 @@ def test_a_letter_goes_from_its_first_to_its_last_point_past_every_corner(letter
 def test_letters_stand_side_by_side_and_pens_begin_below_with_a_small_sideways_velocity() -> None:
     p = params(word="SSAIL", jitter=0.0)
     first = letters.generate(p).train
-    np.testing.assert_allclose(np.diff(first.positions[0, 0, :, 0]), letters.WIDTH + letters.GAP)
-    np.testing.assert_allclose(
-        first.positions[0, :, 1] - first.positions[0, :, 0], [[letters.WIDTH + letters.GAP, 0]] * 60
-    )
+    pitch = letters.WIDTH + letters.GAP
+    np.testing.assert_allclose(np.diff(first.positions[0, 0, :, 0]), pitch)
+    np.testing.assert_allclose(first.positions[0, :, 1] - first.positions[0, :, 0], [[pitch, 0]] * 60)
     assert (first.positions[0, 0, :, 1] < 0).all()
     np.testing.assert_allclose(first.velocities[0, 0], [[letters.LINE / (p.steps - 1), 0]] * 5, atol=1e-12)
 

@@ -14,11 +14,8 @@ def test_minimum_jerk_begins_and_ends_at_rest() -> None:
     """
     assert pen.progress(np.array([-1.0, 0.0, 0.25, 0.5, 1.0, 2.0])).tolist() == [0, 0, 0.103515625, 0.5, 1, 1]
     h = 1e-4
-    speed = (pen.progress(np.array([h, 0.5 + h, 1.0])) - pen.progress(np.array([0.0, 0.5 - h, 1.0 - h]))) / [
-        h,
-        2 * h,
-        h,
-    ]
+    change = pen.progress(np.array([h, 0.5 + h, 1.0])) - pen.progress(np.array([0.0, 0.5 - h, 1.0 - h]))
+    speed = change / [h, 2 * h, h]
     np.testing.assert_allclose(speed, [0, 1.875, 0], atol=1e-6)
     assert pen.progress(np.array(h)) < 1e-10  # of third order: no acceleration
 

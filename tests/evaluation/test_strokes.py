@@ -31,7 +31,7 @@ def test_the_letter_itself_has_distance_zero_in_any_order_and_tempo() -> None:
 
 
 def test_a_line_beside_the_letter_is_as_far_as_it_is_beside() -> None:
-    assert distance(BAR + [0, 0.2]) == pytest.approx(0.2)
+    assert distance(BAR + np.array([0, 0.2])) == pytest.approx(0.2)
 
 
 def test_half_a_letter_is_not_a_letter() -> None:
