@@ -121,6 +121,9 @@ class ModelSpec(Frozen):
     agent_input: bool  # every network reads which agent it looks at, one-hot (agents that are not alike, as joints)
     action_step: Positive  # an action moves a velocity by at most this much, scaled units
     action_bound: Positive  # and never beyond this absolute value
+    initial_scale: (
+        NonNegative  # of the actor's last weights: how far the untrained policy's mean strays from the velocity
+    )
     log_std_min: Finite
     log_std_max: Finite
 
@@ -305,8 +308,8 @@ class RunSpec(Frozen):
         """
         values = self.model_dump(mode="json", exclude_none=True)
         for section, key, before in LATER:
-            if section in values and values[section][key] == before:
-                del values[section][key]
+            if section in values and values[section].get(key) == before:
+                values[section].pop(key, None)
         return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
 
     @classmethod
@@ -337,7 +340,11 @@ def _canonical(values: Any) -> str:
     return json.dumps(values, sort_keys=True, separators=(",", ":"))
 
 
-LATER: tuple[tuple[str, str, Any], ...] = (("self_supervision", "label", "identity"),)
+LATER: tuple[tuple[str, str, Any], ...] = (
+    ("self_supervision", "label", "identity"),
+    ("data", "letters", None),
+    ("model", "initial_scale", 0.1),
+)
 """(section, key, value) of what runs of earlier versions had without a name for it."""
 
 OPTIONAL_SECTIONS = tuple(

@@ -19,7 +19,9 @@ def toy(method: str, *overrides: str) -> RunSpec:
 def test_the_expert_is_the_best_and_constant_velocity_draws_nothing() -> None:
     values, arrays = TrainingLoop(toy("constant-velocity"), 0).final_evaluation()
     assert values["test_expert/stroke_distance"] < 0.03
-    assert values["test/stroke_distance"] == values["test_constant_velocity/stroke_distance"] > 0.5
+    distance = values["test_constant_velocity/stroke_distance"]
+    assert values["test/stroke_distance"] == pytest.approx(distance)
+    assert distance > 0.8
     ruled = (
         arrays["test/expert"][:, :1]
         + np.arange(60)[None, :, None, None] * np.diff(arrays["test/rollouts"][0], axis=1)[:, :1]
@@ -61,7 +63,7 @@ def test_every_method_draws(method: str) -> None:
 
 
 def test_the_untrained_policy_is_that_of_before_training_even_in_a_resumed_run(tmp_path: Path) -> None:
-    """And it keeps near the lower half by its mean; the trained one is another (negative control)."""
+    """And it stays in the lower half by its mean; the trained one is another (negative control)."""
     loop = TrainingLoop(toy("ssail"), 3)
     before = loop.evaluator.beginning(loop.learner.predictor)
     loop.run_epoch()
@@ -71,6 +73,7 @@ def test_the_untrained_policy_is_that_of_before_training_even_in_a_resumed_run(t
     _, arrays = resumed.final_evaluation()
     for name in ("initial/rollouts", "initial_mean/rollouts"):
         np.testing.assert_array_equal(arrays[name], before[name])
+    assert arrays["initial_mean/rollouts"][..., 1].max() < 0
     after = resumed.evaluator.beginning(resumed.learner.predictor)
     assert not np.array_equal(after["initial/rollouts"], before["initial/rollouts"])
 
