@@ -68,6 +68,11 @@ def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict
         ("letters", "data.letters.word=ml", "data.letters.word: takes 1 to 6 capital letters A to Z, not 'ml'."),
         (
             "letters",
+            "data.letters.word=NO",
+            "data.letters.word: takes 1 to 6 capital letters A to Z; YAML reads NO, ON",
+        ),
+        (
+            "letters",
             "data.letters.wrod=ML",
             "unknown key 'data.letters.wrod' in --set; did you mean data.letters.word?",
         ),

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ssmail.shaping import AlphaDensity, AlphaPiece, Label
 
@@ -76,17 +76,20 @@ class YJunctionSpec(Frozen):
 MOST_LETTERS = 6
 
 
-def check_word(word: str) -> str:
+def check_word(word: Any) -> Any:
     """The word. Raises ValueError unless it is 1 to 6 capital letters."""
+    wanted = f"takes 1 to {MOST_LETTERS} capital letters A to Z"
+    if not isinstance(word, str):
+        raise ValueError(f"{wanted}; YAML reads NO, ON, YES and NULL as something else, unless in quotes as '\"NO\"'")
     if not (1 <= len(word) <= MOST_LETTERS and word.isascii() and word.isalpha() and word.isupper()):
-        raise ValueError(f"takes 1 to {MOST_LETTERS} capital letters A to Z, not {word[:20]!r}")
+        raise ValueError(f"{wanted}, not {word[:20]!r}")
     return word
 
 
 class LettersSpec(Frozen):
     """The word that is drawn and the size of the letters' expert set (sections 1 and A.2)."""
 
-    word: Annotated[str, AfterValidator(check_word)]  # one agent for each letter
+    word: Annotated[str, BeforeValidator(check_word)]  # one agent for each letter
     train: Count  # trajectories
     validation: Count
     test: Count

@@ -88,6 +88,8 @@ def _end(cell: Cell, kind: Any, store: Store, report: Report) -> Event:
     error = {"yjunction": "mode_mse", "letters": "stroke_distance", "mocap": "mse"}[cell.spec.environment]
     for epoch in range(1, epochs + 1):
         metrics = {f"validation/{error}": 0.1 / epoch, "critic/loss": 0.5}
+        if cell.spec.environment == "letters":
+            metrics["validation/mse"] = 0.3  # which is shown of mocap
         writer.epoch(epoch, {**metrics, f"train/{error}": 0.2 / epoch})
         report(Event("epoch", cell, writer.run_id, epoch, epochs, metrics))
     if kind == "finished":
