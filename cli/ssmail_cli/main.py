@@ -24,6 +24,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("generate-yjunction")(data.generate_yjunction)
+app.command("generate-letters")(data.generate_letters)
 app.command("prep-mocap")(mocap.prep_mocap)
 app.command("train")(train.train)
 app.command("ablate")(ablate.ablate)

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from ssmail import strict_yaml
 from ssmail.errors import InputError
-from ssmail.spec import ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
+from ssmail.spec import ENVIRONMENTS, GENERATED, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
 from ssmail.spec_keys import check_keys, check_section, nearest, sentence
 from ssmail.user_functions import UserFunction, pinned
 
@@ -214,8 +214,7 @@ def _assemble(
         merged = _merge(merged, layer.values)
     if method in METHODS and environment in ENVIRONMENTS:
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(sections_of(method, environment)))
-        if environment != "yjunction":
-            merged["data"] = {**merged.get("data", {}), "yjunction": None}
+        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED) - {environment})}
     section, key = _LABEL
     if isinstance(merged.get(section), Mapping) and key in merged[section]:
         merged = _merge(merged, {section: {key: _pinned(merged[section][key], experiments)}})

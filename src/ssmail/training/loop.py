@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from ssmail.data.expert_file import load
+from ssmail.data.generators import generate
 from ssmail.data.trajectories import ExpertSet
-from ssmail.data.yjunction import generate
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
-from ssmail.spec import RunSpec, used
+from ssmail.spec import RunSpec
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.experts import scaled_batch
 from ssmail.training.learning import Setting
@@ -32,9 +32,9 @@ class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fau
 
 def expert_set(spec: RunSpec) -> ExpertSet:
     """The expert data of a spec: its file, or the generator's set when it names none."""
-    if spec.data.path is None:
-        return generate(used(spec.data.yjunction))
-    return load(Path(spec.data.path), spec.environment)
+    if spec.data.path is not None:
+        return load(Path(spec.data.path), spec.environment)
+    return generate(spec.data)
 
 
 class TrainingLoop:
@@ -57,6 +57,7 @@ class TrainingLoop:
         self.best_error = math.inf
         self.best_epoch = 0
         self.best_weights = deepcopy(self.learner.predictor.state_dict())
+        self.untrained = deepcopy(self.learner.predictor)
 
     def run_epoch(self) -> dict[str, float]:
         """One epoch of training and its validation; returns the epoch's metrics. Raises Divergence when weights stop
@@ -82,7 +83,7 @@ class TrainingLoop:
         best = deepcopy(self.learner.predictor)
         best.load_state_dict(self.best_weights)
         values, arrays = self.evaluator.final(best, self.learner.predictor)
-        return {"best_epoch": float(self.best_epoch), **values}, arrays
+        return {"best_epoch": float(self.best_epoch), **values}, {**arrays, **self.evaluator.beginning(self.untrained)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue as if never interrupted: tensors and plain data only."""
