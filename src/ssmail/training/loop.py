@@ -21,6 +21,7 @@ from ssmail.errors import SsmailError
 from ssmail.spec import RunSpec
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.experts import scaled_batch
+from ssmail.training.landscapes import Landscapes, looks
 from ssmail.training.learning import Setting
 from ssmail.training.methods import make_learner
 from ssmail.training.seeding import Generators
@@ -38,7 +39,10 @@ def expert_set(spec: RunSpec) -> ExpertSet:
 
 
 class TrainingLoop:
-    """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`."""
+    """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`.
+
+    `snapshot` holds the arrays to keep of the epoch that has just ended, or of the untrained model; mostly none.
+    """
 
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
         self.spec, self.device = spec, torch.device(device)
@@ -58,6 +62,9 @@ class TrainingLoop:
         self.best_epoch = 0
         self.best_weights = deepcopy(self.learner.predictor.state_dict())
         self.untrained = deepcopy(self.learner.predictor)
+        self.landscapes = Landscapes.of(setting, self.learner)
+        self.snapshot: dict[str, np.ndarray] = {}
+        self._look()
 
     def run_epoch(self) -> dict[str, float]:
         """One epoch of training and its validation; returns the epoch's metrics. Raises Divergence when weights stop
@@ -69,7 +76,16 @@ class TrainingLoop:
         values |= self.evaluator.epoch(self.learner.predictor)
         self.epoch += 1
         self._select(*self.evaluator.rank(values))
+        values |= self._look()
         return values | {"seconds": time.perf_counter() - began}
+
+    def _look(self) -> dict[str, float]:
+        """Look at the learned reward, if this is an epoch for it: the numbers; the arrays are `snapshot`."""
+        values: dict[str, float] = {}
+        self.snapshot = {}
+        if self.landscapes is not None and self.epoch in looks(self.spec):
+            values, self.snapshot = self.landscapes.look(self.epoch)
+        return values
 
     def _select(self, flawed: bool, error: float) -> None:
         """Keep this epoch's model if it is the best so far by the evaluator's rank."""
@@ -101,7 +117,7 @@ class TrainingLoop:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`, for a loop made with the same spec and seed."""
-        self.epoch = state["epoch"]
+        self.epoch, self.snapshot = state["epoch"], {}
         best = state["best"]
         self.best_flawed, self.best_error = best["flawed"], best["error"]
         self.best_epoch, self.best_weights = best["epoch"], best["weights"]
