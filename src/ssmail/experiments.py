@@ -111,10 +111,10 @@ def ablation_specs(
     return _ablation_specs(experiments, _ablation(experiments, name, environment), profile, values, overrides)
 
 
-def ablation_hashes(name: str, file: Path | None = None) -> list[str]:
-    """The hashes of the ablation's specs in every profile."""
+def ablation_hashes(name: str, environment: str | None = None, file: Path | None = None) -> list[str]:
+    """The hashes of the ablation's specs in every profile, on its own environment or another one."""
     experiments = load_experiments(file)
-    wanted = _ablation(experiments, name)
+    wanted = _ablation(experiments, name, environment)
     found = (_ablation_specs(experiments, wanted, profile, None, ()) for profile in experiments.profiles)
     return [spec.hash() for specs in found for spec in specs.values()]
 
@@ -128,9 +128,7 @@ def figure_requirements(name: str, file: Path | None = None) -> FigureRequiremen
         raise InputError(f"{source} needs an environment, and either methods or an ablation; correct it.")
     if "methods" in entry:
         return FigureRequirements(entry["environment"], tuple(entry["methods"]))
-    needed = _ablation(experiments, entry["ablation"])
-    if needed.environment != entry["environment"]:
-        raise InputError(f"{source} draws {entry['environment']}, but its ablation is of {needed.environment}.")
+    needed = _ablation(experiments, entry["ablation"], entry["environment"])
     return FigureRequirements(needed.environment, (needed.method,), needed.name)
 
 

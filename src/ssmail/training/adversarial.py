@@ -119,9 +119,7 @@ class AdversarialLearner:
     def update(self, latest: Batch, *, actor_learns: bool = True) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
         logs = [self._update_discriminator(latest) for _ in range(self.adversarial.updates)]
-        values = self.actor_critic.update(
-            self._actor_batch(), self._pick_steps, self.reward, actor_learns=actor_learns
-        )
+        values = self.actor_critic.update(self._actor_batch(), self._pick_steps, self.reward, actor_learns=actor_learns)
         return mean_of(logs) | {name: float(value.detach()) for name, value in values.items()}
 
     def _update_discriminator(self, latest: Batch) -> dict[str, float]:

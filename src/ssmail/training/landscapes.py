@@ -170,11 +170,12 @@ class Landscapes:
         return values, arrays
 
     def _frame(self) -> Arrays:
-        """What all looks share, in raw units: the axes of the plane and the references."""
+        """What all looks share, in raw units: the axes of the plane, the length of a scaled unit, some experts."""
         scaling = self.setting.integrator.scaling
         axes = {name: scaling.unscale_positions(getattr(self.plane, name)).astype(np.float32) for name in ("x", "y")}
         expert = self._raw(self.setting.experts.states[_spread(len(self.setting.experts), SHOWN)])
-        return {"landscape/x": axes["x"], "landscape/y": axes["y"], "landscape/expert": expert}
+        unit = np.array([scaling.position_span / 2])
+        return {"landscape/x": axes["x"], "landscape/y": axes["y"], "landscape/unit": unit, "landscape/expert": expert}
 
     def _raw(self, states: Tensor) -> np.ndarray:
         """Raw positions (..., 2) of scaled states."""
