@@ -6,6 +6,7 @@ import pytest
 from ssmail.evaluation.landscape import (
     CELLS,
     MARGIN,
+    NEAR,
     PROGRESS,
     Plane,
     closeness,
@@ -116,8 +117,10 @@ def test_points_on_the_expert_do_not_count() -> None:
 def test_closeness() -> None:
     weights = closeness(np.array([[0.0, 0.0], [0.5, 0.0], [0.5, 7.0]]), TRACK)
     assert weights.sum(axis=-1) == pytest.approx(1)
-    assert weights[0] == pytest.approx([1, 0, 0], abs=1e-9)
-    assert weights[1] == pytest.approx(np.array([1, 1, 3.0**-4]) / (2 + 3.0**-4))
+    by_hand = (np.array([0, 1, 4]) + NEAR**2) ** -2.0
+    assert weights[0] == pytest.approx(by_hand / by_hand.sum())
+    assert weights[0, 0] > 0.999
+    assert weights[1, 0] == weights[1, 1] > 0.49
     assert weights[2].max() < 0.4  # far away all count
 
 

@@ -12,7 +12,7 @@ from ssmail.data.trajectories import Floats
 CELLS = 40  # of the grid along the longer side of the plane
 MARGIN = 0.15  # of the plane around the expert's bounding box, as a share of the box's longer side
 USABLE = 0.25  # a slope is usable from this fraction of the even slope on
-SHARPNESS = 4  # the power of the distance with which expert states lose their weight
+NEAR = 0.1  # expert states that are nearer than this have about the same weight
 PROGRESS = 0.5  # what the whole way along the stroke is worth in the ideal reward, scaled units
 
 
@@ -87,10 +87,11 @@ def nearest_points(points: Floats, track: Floats) -> Floats:
 
 
 def closeness(points: Floats, places: Floats) -> Floats:
-    """(..., K) weights of `places` (K, 2) for each of `points` (..., 2): distance to the power of -SHARPNESS, sum 1."""
-    distances = np.linalg.norm(points[..., None, :] - places, axis=-1)
-    relative = distances.min(axis=-1, keepdims=True) / np.maximum(distances, 1e-9)
-    weights = np.where(distances < 1e-9, 1.0, relative) ** SHARPNESS
+    """(..., K) weights of `places` (K, 2) for each of `points` (..., 2): the inverse square of d**2 + NEAR**2, with d
+    the distance; their sum is 1.
+    """
+    squares = np.square(points[..., None, :] - places).sum(axis=-1) + NEAR**2
+    weights = np.square(squares.min(axis=-1, keepdims=True) / squares)
     normal: Floats = weights / weights.sum(axis=-1, keepdims=True)
     return normal
 

@@ -17,8 +17,8 @@ from ssmail.models.features import Features
 from ssmail.spec import RunSpec
 from ssmail.training.learning import Learner, Predictor, Setting
 
-REFERENCES = 4  # training trajectories whose states stand in for what a point of the plane leaves open
-STATES = 12  # of a reference, evenly over its steps
+REFERENCES = 2  # training trajectories whose states stand in for what a point of the plane leaves open
+STATES = 24  # of a reference, evenly over its steps
 SHOWN = 16  # training trajectories that pictures show
 ROLLOUTS = 8  # current trajectories, from the starts of the first of the references
 CURRENT = 0.1  # the fraction of the epochs after which the policy is "the current one" of Figure 2
