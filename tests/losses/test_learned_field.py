@@ -7,6 +7,7 @@ functions and Eq. 3; no noise on its inputs. Then D is asked along the segment, 
 
 import functools
 
+import pytest
 import torch
 from torch import Tensor
 

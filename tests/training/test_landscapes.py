@@ -1,6 +1,7 @@
 """Looking at a reward while it is learned: fields known in closed form, and that looking changes nothing."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from torch import Tensor
 
 from ssmail.experiments import build_spec
 from ssmail.models.features import Features
+from ssmail.models.standards import Standards
 from ssmail.spec import RunSpec
 from ssmail.training import landscapes
-from ssmail.training.landscapes import Landscapes, current_epoch, looks, position_gradient
+from ssmail.training.landscapes import Landscapes, Moments, current_epoch, looks, position_gradient
 from ssmail.training.learning import Setting
 from ssmail.training.loop import TrainingLoop
 from ssmail.training.references import ConstantVelocity
@@ -27,21 +29,17 @@ def loop() -> TrainingLoop:
     return TrainingLoop(build_spec("ssail", "yjunction", "smoke"), 0)
 
 
+class Handmade:
+    """A learner with a reward in closed form, whose policy drives straight on."""
+
+    def __init__(self, loop: TrainingLoop, reward: Reward, features: Features) -> None:
+        self.reward, self.features, self.predictor = reward, features, ConstantVelocity(loop.integrator)
+
+
 def looking(loop: TrainingLoop, reward: Reward) -> Landscapes:
-    """At a handmade reward; the policy drives straight on."""
-
-    class Handmade:
-        features = Features(False, False, 50)
-        predictor = ConstantVelocity(loop.integrator)
-
-        def reward(self, x: Tensor, actions: Tensor) -> Tensor:
-            return reward(x, actions)
-
-    return Landscapes(loop.landscapes.setting if loop.landscapes else _never(), Handmade())
-
-
-def _never() -> Setting:
-    raise AssertionError("ssail on a plane has landscapes")
+    """At a handmade reward."""
+    assert loop.landscapes is not None
+    return Landscapes(loop.landscapes.setting, Handmade(loop, reward, Features(False, False, 50)))
 
 
 def linear(x: Tensor, actions: Tensor) -> Tensor:
@@ -49,15 +47,30 @@ def linear(x: Tensor, actions: Tensor) -> Tensor:
     return 3 * x[..., 0] - 4 * x[..., 1] + actions.sum(dim=-1) + x[..., :1, 2]
 
 
-def test_the_gradient_is_of_the_agents_own_position_alone() -> None:
+def test_the_gradient_is_of_the_agents_own_position_alone(loop: TrainingLoop) -> None:
     def reward(x: Tensor, actions: Tensor) -> Tensor:
-        return x[..., 0] ** 2 + 5 * x[..., 1] + 7 * x.sum(dim=(-2, -1), keepdim=True)[..., 0] - 7 * x.sum(dim=-1)
+        others = x.sum(dim=(-2, -1), keepdim=True)[..., 0] - x.sum(dim=-1)
+        return x[..., 0] ** 2 + 5 * x[..., 1] + 7 * others + x[..., 4]
 
-    x = torch.randn(6, 3, 4)
-    values, gradient = position_gradient(reward, x, torch.zeros(6, 3, 2), 1)
-    torch.testing.assert_close(gradient, torch.stack([2 * x[:, 1, 0], torch.full((6,), 5.0)], dim=-1))
-    torch.testing.assert_close(values, reward(x, torch.zeros(6, 3, 2))[:, 1])
-    assert not x.requires_grad
+    states = torch.randn(2, 4, 3, 4)
+    learner = Handmade(loop, reward, Features(True, True, 4))
+    at = Moments.of(learner.features, states, torch.zeros(2, 3, 3, 2))
+    assert at.beside.shape == (2, 3, 3, 1 + 4)  # the step and the first state
+    values, gradient = position_gradient(learner, at, 1)
+    expected = torch.stack([2 * states[:, :-1, 1, 0], torch.full((2, 3), 5.0)], dim=-1)
+    torch.testing.assert_close(gradient, expected)
+    torch.testing.assert_close(values, reward(learner.features(states[:, :-1], states[:, 0]), at.actions)[..., 1])
+
+
+def test_the_gradient_is_in_scaled_units_whatever_the_networks_read(loop: TrainingLoop) -> None:
+    states = loop.experts.states
+    plain = Features(False, False, 50)
+    features = replace(plain, standards=Standards.of(states))
+    learner = Handmade(loop, lambda x, actions: x[..., 0], features)
+    _, gradient = position_gradient(learner, Moments.of(features, states, loop.experts.actions), 2)
+    expected = 1 / Standards.of(states).spread[2, 0]
+    torch.testing.assert_close(gradient[..., 0].max(), expected)
+    assert expected != 1
 
 
 def test_a_linear_reward_is_a_plane_with_share_1(loop: TrainingLoop) -> None:
@@ -89,7 +102,7 @@ def test_the_reference_is_an_expert_state_that_is_near(loop: TrainingLoop) -> No
     reward, gradient = look.field()
     assert not gradient.any()
     for agent in range(3):
-        at = look.x[:, agent]
+        at = look.references.states[:, agent]
         for k in (0, 17, -1):  # on a reference itself, that reference decides
             row = np.abs(look.plane.y - float(at[k, 1])).argmin()
             column = np.abs(look.plane.x - float(at[k, 0])).argmin()

@@ -4,7 +4,7 @@ Only planar environments and methods that learn a reward have landscapes. Lookin
 generator of their own, the same in every look.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -26,7 +26,6 @@ BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # alphas of the points behind t
 AHEAD = tuple(a / 8 for a in range(8))  # and of those on it and before it
 
 Arrays = dict[str, np.ndarray]
-Reward = Callable[[Tensor, Tensor], Tensor]
 
 
 @runtime_checkable
@@ -57,14 +56,32 @@ def current_epoch(spec: RunSpec) -> int:
     return max(1, round(CURRENT * spec.epochs))
 
 
-def position_gradient(reward: Reward, x: Tensor, actions: Tensor, agent: int) -> tuple[Tensor, Tensor]:
-    """The agent's reward (...) at features x (..., N, F) and its gradient (..., 2) with respect to the agent's own
-    position, everything else held.
+@dataclass(frozen=True)
+class Moments:
+    """Moments (...) of a group: its states (..., N, D) in scaled units, what is read beside them (..., N, F - D), and
+    the actions (..., N, A) as they are read.
     """
-    position = x[..., agent, :2].detach().clone().requires_grad_()
-    moved = x.detach().clone()
+
+    states: Tensor
+    beside: Tensor
+    actions: Tensor
+
+    @classmethod
+    def of(cls, features: Features, states: Tensor, actions: Tensor) -> "Moments":
+        """Those of trajectories: states (B, T + 1, N, D), of which the last is left out, and actions (B, T, N, A)."""
+        beside = features(states[:, :-1], states[:, 0])[..., states.shape[-1] :]
+        return cls(states[:, :-1], beside, features.of_actions(actions))
+
+
+def position_gradient(learner: RewardLearner, at: Moments, agent: int) -> tuple[Tensor, Tensor]:
+    """The agent's reward (...) at moments (...) and its gradient (..., 2) with respect to the agent's own position,
+    everything else held.
+    """
+    position = at.states[..., agent, :2].detach().clone().requires_grad_()
+    moved = at.states.detach().clone()
     moved[..., agent, :2] = position
-    values = reward(moved, actions)[..., agent]
+    x = torch.cat([learner.features.read(moved), at.beside], dim=-1)
+    values = learner.reward(x, at.actions)[..., agent]
     (gradient,) = torch.autograd.grad(values.sum(), position)
     return values.detach(), gradient
 
@@ -78,23 +95,21 @@ class Landscapes:
         chosen = torch.as_tensor(_spread(len(experts), REFERENCES), device=setting.device)
         steps = torch.as_tensor(_spread(setting.steps, STATES), device=setting.device)
         states = experts.states[chosen]
-        self.x = learner.features(states[:, :-1], states[:, 0])[:, steps].flatten(0, 1)  # (K, N, F)
-        self.actions = experts.actions[chosen][:, steps].flatten(0, 1)
+        all_steps = Moments.of(learner.features, states, experts.actions[chosen])
+        self.references = Moments(*(part[:, steps].flatten(0, 1) for part in vars(all_steps).values()))  # (K)
         self.agents = states.shape[2]
         everywhere = _numpy(experts.states[..., :2])  # (B, T + 1, N, 2)
         self.plane = Plane.around(everywhere)
         points, tracks = self.plane.points, [everywhere[:, :, n].reshape(-1, 2) for n in range(self.agents)]
         self.ways = np.stack([nearest_points(points, track) - points for track in tracks])
-        places = [_numpy(self.x[:, n, :2]) for n in range(self.agents)]
+        places = [_numpy(self.references.states[:, n, :2]) for n in range(self.agents)]
         self.weights = torch.as_tensor(np.stack([closeness(points, place) for place in places]))
 
     @classmethod
     def of(cls, setting: Setting, learner: Learner) -> "Landscapes | None":
         """Those of a learner, or None where there is no plane or no reward."""
         planar = setting.experts.actions.shape[-1] == 2
-        if not planar or not isinstance(learner, RewardLearner) or learner.features.root_relative:
-            return None
-        return cls(setting, learner)
+        return cls(setting, learner) if planar and isinstance(learner, RewardLearner) else None
 
     def look(self, epoch: int) -> tuple[dict[str, float], Arrays]:
         """The numbers and the arrays of the model as it is after `epoch` epochs; see docs/database.md."""
@@ -122,14 +137,14 @@ class Landscapes:
 
         The agent is put on each point; all else is that of the nearest of its own positions in the references.
         """
-        points = torch.as_tensor(self.plane.points, dtype=self.x.dtype, device=self.x.device)
-        shape = (*points.shape[:2], len(self.x))
+        known = self.references
+        points = torch.as_tensor(self.plane.points, dtype=known.states.dtype, device=known.states.device)
+        here = [part.expand(*points.shape[:2], *part.shape) for part in vars(known).values()]  # (H, W, K)
         rewards, gradients = [], []
         for agent, weights in enumerate(self.weights):
-            x = self.x.expand(*shape, *self.x.shape[1:]).clone()
-            x[..., agent, :2] = points.unsqueeze(2)
-            actions = self.actions.expand(*shape, *self.actions.shape[1:])
-            reward, gradient = position_gradient(self.learner.reward, x, actions, agent)
+            states = here[0].clone()
+            states[..., agent, :2] = points.unsqueeze(2)
+            reward, gradient = position_gradient(self.learner, Moments(states, *here[1:]), agent)
             rewards.append((weights * _double(reward)).sum(dim=2))
             gradients.append((weights.unsqueeze(-1) * _double(gradient)).sum(dim=2))
         return torch.stack(rewards).numpy(), torch.stack(gradients).numpy()
@@ -151,8 +166,8 @@ class Landscapes:
         states = mix(made.repeat(count, 1, 1, 1), experts.states.repeat(count, 1, 1, 1), each)
         taken = made[:, 1:, :, 2:]  # the environment's actions are the next velocities
         actions = mix(taken.repeat(count, 1, 1, 1), experts.actions.repeat(count, 1, 1, 1), each)
-        x = self.learner.features(states[:, :-1], states[:, 0])
-        found = [position_gradient(self.learner.reward, x, actions, agent)[1] for agent in range(self.agents)]
+        at = Moments.of(self.learner.features, states, actions)
+        found = [position_gradient(self.learner, at, agent)[1] for agent in range(self.agents)]
         gradient = _numpy(torch.stack(found, dim=2)).reshape(count, rollouts, -1, self.agents, 2)
         here = _numpy(states[:, :-1, :, :2]).reshape(gradient.shape)
         ways = _numpy(experts.states[:, :-1, :, :2]) - here
