@@ -12,6 +12,7 @@ from ssmail.errors import InputError
 from ssmail.experiments import (
     ENVIRONMENT_VARIABLE,
     FigureRequirements,
+    ablation,
     build_spec,
     figure_requirements,
     load_experiments,
@@ -234,7 +235,7 @@ def test_the_environment_variable_replaces_the_shipped_file(tmp_path: Path, monk
         ({"methods": ["ssail"]}, "figures.fig6 of e.yaml needs an environment, and either methods or an ablation"),
         ({"environment": "yjunction"}, "figures.fig6 of e.yaml needs an environment, and either methods or an "),
         ({"environment": "yjunction", "ablation": "bta"}, "unknown ablation 'bta'; did you mean beta?"),
-        ({"environment": "mocap", "ablation": "beta"}, "figures.fig6 of e.yaml draws mocap, but its ablation is of "),
+        ({"environment": "moon", "ablation": "beta"}, "unknown environment 'moon'; "),
     ],
 )
 def test_a_wrong_figure_in_the_file_is_one_sentence(tmp_path: Path, entry: dict[str, Any], sentence: str) -> None:
@@ -247,5 +248,7 @@ def test_a_wrong_figure_in_the_file_is_one_sentence(tmp_path: Path, entry: dict[
 def test_a_figure_names_its_runs() -> None:
     assert figure_requirements("fig4") == FigureRequirements("yjunction", ("ssail", "gail", "wail"))
     assert figure_requirements("fig6") == FigureRequirements("yjunction", ("ssail",), "beta")
+    assert ablation("alpha").environment == "mocap"  # figure 2 draws it elsewhere
+    assert figure_requirements("fig2") == FigureRequirements("letters", ("ssail",), "alpha")
     with pytest.raises(InputError, match=r"unknown figure 'figg5'; did you mean fig5\?"):
         figure_requirements("figg5")

@@ -15,6 +15,8 @@ from ssmail.experiments import build_spec
 from ssmail.shaping import read_label
 from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
 
+NO_DATA = {"path": None, "yjunction": None, "letters": None}
+
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
 @pytest.mark.parametrize("method", METHODS)
@@ -24,6 +26,7 @@ def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, envi
     assert there == set(sections_of(method, environment)) == {*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment]}
     assert (made.forecast is not None) is (environment == "mocap")
     assert (made.data.yjunction is not None) is (environment == "yjunction")
+    assert (made.data.letters is not None) is (environment == "letters")
     assert (made.data.path is not None) is (environment == "mocap")
 
 
@@ -33,13 +36,19 @@ def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, envi
         ("yjunction", {"forecast": "of mocap"}, "bc on yjunction has no section forecast"),
         ("mocap", {"forecast": None}, "bc on mocap needs section forecast"),
         ("mocap", {"cloning": None}, "bc on mocap needs section cloning"),
-        ("yjunction", {"data": {"path": None, "yjunction": None}}, "environment yjunction needs data.yjunction"),
-        ("mocap", {"data": {"path": None, "yjunction": None}}, "environment mocap needs a data file; set data.path"),
+        ("yjunction", {"data": NO_DATA}, "environment yjunction needs data.yjunction"),
+        ("letters", {"data": NO_DATA}, "environment letters needs data.letters"),
+        ("mocap", {"data": NO_DATA}, "environment mocap needs a data file; set data.path"),
+        ("yjunction", {"data": "of letters"}, "environment yjunction needs data.yjunction"),
+        ("mocap", {"data": "of letters"}, "environment mocap has no data.letters"),
     ],
 )
 def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict[str, object], sentence: str) -> None:
-    forecast = build_spec("bc", "mocap", "smoke").forecast
-    changes = {name: forecast if value == "of mocap" else value for name, value in changes.items()}
+    others = {
+        "of mocap": build_spec("bc", "mocap", "smoke").forecast,
+        "of letters": build_spec("bc", "letters", "smoke").data,
+    }
+    changes = {name: others[value] if isinstance(value, str) else value for name, value in changes.items()}
     values = {**build_spec("bc", environment, "smoke").model_dump(), **changes}
     with pytest.raises(ValidationError, match=sentence):
         RunSpec.from_mapping(values)
@@ -54,6 +63,19 @@ def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict
             "method bc on yjunction has no section 'forecast' to set in --set; it belongs to mocap.",
         ),
         ("mocap", "data.yjunction.train=3", "environment mocap has no section 'data.yjunction' to set in --set."),
+        ("letters", "data.yjunction.train=3", "environment letters has no section 'data.yjunction' to set in --set."),
+        ("yjunction", "data.letters={word: A}", "environment yjunction has no section 'data.letters' to set in --set."),
+        ("letters", "data.letters.word=ml", "data.letters.word: takes 1 to 6 capital letters A to Z, not 'ml'."),
+        (
+            "letters",
+            "data.letters.word=NO",
+            "data.letters.word: takes 1 to 6 capital letters A to Z; YAML reads NO, ON",
+        ),
+        (
+            "letters",
+            "data.letters.wrod=ML",
+            "unknown key 'data.letters.wrod' in --set; did you mean data.letters.word?",
+        ),
         ("mocap", "data.path=null", "environment mocap needs a data file; set data.path"),
         ("mocap", "forecast.observed=0", "forecast.observed = 0 in --set should be greater than or equal to 1."),
         ("mocap", "forecast.noise_on=some", "forecast.noise_on = some in --set should be 'all' or 'history'."),

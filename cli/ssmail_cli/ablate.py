@@ -114,10 +114,10 @@ def _point_to_figures(name: str, environment: str | None, db: str) -> None:
     from ssmail.experiments import ablation, figure_requirements, load_experiments
     from ssmail.figures import FIGURES
 
-    elsewhere = environment not in (None, ablation(name).environment)
-    where = f" --env {environment}" if elsewhere else ""
-    where += "" if db == DEFAULT_DATABASE else f" --db {db}"
+    trained = ablation(name, environment).environment
+    database = "" if db == DEFAULT_DATABASE else f" --db {db}"
     for figure in load_experiments().figures:
-        drawn = figure in FIGURES and figure_requirements(figure).ablation == name
-        if drawn and (not elsewhere or FIGURES[figure].has_environment):
-            note(f"`ssmail plot {figure}{where}` draws these runs")
+        needed = figure_requirements(figure)
+        own = needed.environment == trained
+        if figure in FIGURES and needed.ablation == name and (own or FIGURES[figure].has_environment):
+            note(f"`ssmail plot {figure}{'' if own else f' --env {trained}'}{database}` draws these runs")

@@ -11,7 +11,7 @@ from ssmail.errors import InputError
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
 
-TRAINING = "training"
+ALL, TRAINING = "all", "training"
 DEFAULT_OUT = Path("results/figures")
 
 OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
@@ -41,6 +41,6 @@ def parse_statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | No
         return None
     if stat not in list(Statistic):
         raise unknown_name("statistic", stat, list(Statistic))
-    if not any(name == TRAINING or (name in FIGURES and FIGURES[name].has_statistic) for name in figures):
+    if not any(name in (ALL, TRAINING) or (name in FIGURES and FIGURES[name].has_statistic) for name in figures):
         raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
     return Statistic(stat)

@@ -18,12 +18,13 @@ INTERRUPTED = 130
 app = typer.Typer(
     name="ssmail",
     help="Run, store and redraw the experiments of SS-MAIL (Self-Supervised Multi-Agent Imitation Learning).",
-    epilog="Exit codes: 0 done, 1 failure, 2 wrong usage or input, 3 some runs did not finish, 130 interrupted.",
+    epilog="Exit codes: 0 done, 1 failure, 2 wrong usage or input, 3 some runs unfinished or missing, 130 interrupted.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("generate-yjunction")(data.generate_yjunction)
+app.command("generate-letters")(data.generate_letters)
 app.command("prep-mocap")(mocap.prep_mocap)
 app.command("train")(train.train)
 app.command("ablate")(ablate.ablate)

@@ -1,4 +1,4 @@
-"""`ssmail plot`: figures of the paper and training curves from the database alone, and the skeleton from its data."""
+"""`ssmail plot`: figures of the paper, training curves and landscapes from the database alone; the skeleton."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail.errors import InputError
-from ssmail_cli.display import note
-from ssmail_cli.figure_options import DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
+from ssmail_cli.display import complaint, note
+from ssmail_cli.figure_options import ALL, DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 from ssmail_cli.results import SHOWN, shown_on
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
 
 SKELETON = "skeleton"
+OF_A_RUN = ("landscape", "film")
+INCOMPLETE = 3
 DEFAULT_GROUPS = "method"
 DEFAULT_METRICS = "; ".join(f"{shown.curve} of {name}" for name, shown in SHOWN.items())
 DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
@@ -30,8 +32,9 @@ def plot(
         list[str],
         typer.Argument(
             metavar="FIGURE...",
-            help="fig3 (curricula), fig4 (stability), fig5 (modes), fig6 (beta), fig7 (noise), fig8 (alpha), "
-            "fig9 (yjunction), training, skeleton.",
+            help="fig1 (landscapes), fig2 (vector-field), fig3 (curricula), fig4 (stability), fig5 (modes), "
+            "fig6 (beta), fig7 (noise), fig8 (alpha), fig9 (yjunction), or all of these; training, landscape, film, "
+            "skeleton.",
         ),
     ],
     out: OutDir = DEFAULT_OUT,
@@ -73,6 +76,13 @@ def plot(
             show_default=DEFAULT_GROUPS,
         ),
     ] = None,
+    run: Annotated[
+        str | None, typer.Option("--run", metavar="RUN", help="landscape, film: of this run (id or its first digits).")
+    ] = None,
+    epoch: Annotated[
+        int | None,
+        typer.Option("--epoch", min=0, help="landscape: after this epoch; 0 is untrained.", show_default="the last"),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option("--data", help="skeleton: the file that prep-mocap wrote.", show_default=DEFAULT_DATA),
@@ -89,10 +99,12 @@ def plot(
     ] = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
-    """Draw figures of the paper, the metrics of any runs over epochs (training), or recorded walking (skeleton).
+    """Draw figures of the paper, the metrics of any runs over epochs (training), the learned reward of any planar run
+    (landscape, film), or recorded walking (skeleton).
 
     Each comes with a CSV of exactly what it shows, and the ids of the runs stand in the metadata of the files. Prints
-    the paths of the files.
+    the paths of the files. `all` draws the paper's figures as far as their runs are stored, tells of the others what
+    makes their runs, and ends with exit code 3 when there are any.
     """
     from ssmail.figures import FIGURES
 
@@ -103,26 +115,71 @@ def plot(
     skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
     _check_owner([TRAINING], training, figures)
     _check_owner([SKELETON], skeleton, figures)
+    _check_owner(OF_A_RUN, {"--run": run}, figures)
+    _check_owner(OF_A_RUN[:1], {"--epoch": epoch}, figures)
     of_any = [key for key, module in FIGURES.items() if module.has_environment]
     _check_owner([TRAINING, *of_any], {"--env": environment}, figures)
     if ids and profile and figures != [TRAINING]:
         raise InputError("--runs names the runs already; leave --profile out.")
     statistic = parse_statistic(stat, figures)
+    if ALL in figures:
+        _draw_all(figures, ids, open_store(db), profile, statistic, out, formats)
+        return
     names = dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures)
-    if set(names) == {SKELETON} and (ids or profile):
-        raise InputError(f"{SKELETON} shows no runs; leave {'--runs' if ids else '--profile'} out.")
+    _check_runs(list(names), ids, profile, run)
     store = open_store(db) if set(names) != {SKELETON} else None
     for name in names:
         if store is None or name == SKELETON:
             _draw_skeleton(data or Path(DEFAULT_DATA), split or DEFAULT_SPLIT, window or 0, bool(animate), out, formats)
         elif name == TRAINING:
             chosen = _chosen(store, ids, methods, environment, profile)
-            usual = list(dict.fromkeys(shown_on(run.environment).curve for run in chosen))
+            usual = list(dict.fromkeys(shown_on(one.environment).curve for one in chosen))
             _draw_training(chosen, store, metrics or usual, group_by, statistic, out, formats)
+        elif name in OF_A_RUN:
+            _draw_run(name, str(run), epoch, store, out, formats)
         else:
             module = FIGURES[name]
             record = module.collect(store, ids, profile=profile, statistic=statistic, environment=environment)
             _save(name, _stem(module, environment), record, module.draw(record), out, formats)
+
+
+def _draw_all(
+    figures: Sequence[str],
+    ids: Sequence[str] | None,
+    store: "Store",
+    profile: str | None,
+    statistic: "Statistic | None",
+    out: Path,
+    formats: Sequence[str] | None,
+) -> None:
+    """The paper's figures, each if it can be drawn; raises Exit(INCOMPLETE) when one cannot."""
+    from ssmail.figures import FIGURES
+
+    if list(figures) != [ALL]:
+        raise InputError(f"{ALL} is every figure of the paper already; give it alone.")
+    if ids:
+        raise InputError(f"{ALL} draws the runs of each figure; leave --runs out.")
+    complete = True
+    for name, module in {module.name: module for module in FIGURES.values()}.items():
+        try:
+            record = module.collect(store, profile=profile, statistic=statistic)
+            _save(name, module.stem, record, module.draw(record), out, formats)
+        except Exception as error:  # the other figures are to be drawn whatever is wrong with this one
+            reason = complaint(error).removeprefix(f"{name} has nothing to draw: ")
+            note(f"{name} is not drawn: {reason}")
+            complete = False
+    if not complete:
+        raise typer.Exit(INCOMPLETE)
+
+
+def _check_runs(names: Sequence[str], ids: Sequence[str] | None, profile: str | None, run: str | None) -> None:
+    """Refuse a choice of runs for figures that show none, or another one."""
+    if set(names) <= {SKELETON, *OF_A_RUN} and (ids or profile):
+        what = "the run of --run" if set(names) & set(OF_A_RUN) else "no runs"
+        raise InputError(f"{names[0]} shows {what}; leave {'--runs' if ids else '--profile'} out.")
+    for name in names:
+        if name in OF_A_RUN and run is None:
+            raise InputError(f"{name} shows one run; name it with --run (`ssmail runs list` shows those there are).")
 
 
 def _check_figures(figures: Sequence[str]) -> None:
@@ -131,8 +188,9 @@ def _check_figures(figures: Sequence[str]) -> None:
     from ssmail.figures import FIGURES
 
     for name in figures:
-        if name not in FIGURES and name not in (TRAINING, SKELETON):
-            raise unknown_name("figure", name, [*FIGURES, TRAINING, SKELETON])
+        others = (ALL, TRAINING, SKELETON, *OF_A_RUN)
+        if name not in FIGURES and name not in others:
+            raise unknown_name("figure", name, [*FIGURES, *others])
 
 
 def _check_owner(owners: Sequence[str], options: Mapping[str, object], figures: Sequence[str]) -> None:
@@ -188,6 +246,19 @@ def _draw_training(
 
     record = training_curves.collect(store, runs, metrics, group_by or DEFAULT_GROUPS, statistic or Statistic.MEAN_STD)
     _save(TRAINING, record.stem, record, training_curves.draw(record), out, formats)
+
+
+def _draw_run(name: str, run: str, epoch: int | None, store: "Store", out: Path, formats: Sequence[str] | None) -> None:
+    """The landscape of a run, or the film of its landscapes."""
+    from ssmail.figures import landscape_film
+
+    record = landscape_film.collect(store, run, name, epoch)
+    if name == landscape_film.LANDSCAPE:
+        _save(name, record.stem, record, landscape_film.draw(record), out, formats)
+        return
+    for remark in record.notes:
+        note(f"{name}: {remark}")
+    typer.echo(landscape_film.save_film(record, out))
 
 
 def _draw_skeleton(

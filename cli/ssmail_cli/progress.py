@@ -55,7 +55,7 @@ class _Log:
             count = f"  [{self._ended}/{len(self._labels)}]" if event.is_final and not few else ""
             note(f"{name}: {_headline(event)}{count}")
         elif few and (event.epoch % max(1, event.epochs // LOG_LINES) == 0 or event.epoch == event.epochs):
-            note(f"{name}: epoch {event.epoch}/{event.epochs}  {_losses(event.metrics)}")
+            note(f"{name}: epoch {event.epoch}/{event.epochs}  {_losses(event)}")
 
 
 def _progress() -> "Progress":
@@ -131,7 +131,7 @@ def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
     if event.kind in ("started", "resumed"):
         progress.reset(task, completed=event.epoch, status=_headline(event))
     elif event.kind == "epoch":
-        progress.update(task, completed=event.epoch, status=_losses(event.metrics))
+        progress.update(task, completed=event.epoch, status=_losses(event))
     else:
         progress.update(task, completed=event.epoch, status=_headline(event))
         progress.stop_task(task)
@@ -150,5 +150,8 @@ def _headline(event: "Event") -> str:
     return words.get(event.kind, f"{event.kind}{run}")
 
 
-def _losses(metrics: Mapping[str, float]) -> str:
-    return "  ".join(f"{word} {metrics[name]:.3g}" for name, word in LABELS.items() if name in metrics)
+def _losses(event: "Event") -> str:
+    """The losses of an epoch, and of the validation metrics the one that is shown of the environment."""
+    metrics, validation = event.metrics, shown_on(event.cell.spec.environment).validation
+    shown = [name for name in LABELS if name in metrics and (name == validation or not name.startswith("validation/"))]
+    return "  ".join(f"{LABELS[name]} {metrics[name]:.3g}" for name in shown)

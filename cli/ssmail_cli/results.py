@@ -36,6 +36,19 @@ SHOWN = {
             "test_constant_velocity/mode_mse": "const.\nvelocity",
         },
     ),
+    "letters": Shown(
+        error="test/stroke_distance",
+        validation="validation/stroke_distance",
+        curve="validation/stroke_distance",
+        metrics={
+            "test/stroke_distance": "stroke\ndistance",
+            "test_mean/stroke_distance": "by the\nmean",
+            "test_last/stroke_distance": "last\nepoch",
+            "test/ade": "ade",
+            "test_constant_velocity/stroke_distance": "const.\nvelocity",
+            "test/diverged": "diverged",
+        },
+    ),
     "mocap": Shown(
         error="test/mse_40",
         validation="validation/mse",

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 
 from ssmail import strict_yaml
 from ssmail.errors import InputError
-from ssmail.spec import ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
+from ssmail.spec import ENVIRONMENTS, GENERATED, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
 from ssmail.spec_keys import check_keys, check_section, nearest, sentence
 from ssmail.user_functions import UserFunction, pinned
 
@@ -111,10 +111,10 @@ def ablation_specs(
     return _ablation_specs(experiments, _ablation(experiments, name, environment), profile, values, overrides)
 
 
-def ablation_hashes(name: str, file: Path | None = None) -> list[str]:
-    """The hashes of the ablation's specs in every profile."""
+def ablation_hashes(name: str, environment: str | None = None, file: Path | None = None) -> list[str]:
+    """The hashes of the ablation's specs in every profile, on its own environment or another one."""
     experiments = load_experiments(file)
-    wanted = _ablation(experiments, name)
+    wanted = _ablation(experiments, name, environment)
     found = (_ablation_specs(experiments, wanted, profile, None, ()) for profile in experiments.profiles)
     return [spec.hash() for specs in found for spec in specs.values()]
 
@@ -128,9 +128,7 @@ def figure_requirements(name: str, file: Path | None = None) -> FigureRequiremen
         raise InputError(f"{source} needs an environment, and either methods or an ablation; correct it.")
     if "methods" in entry:
         return FigureRequirements(entry["environment"], tuple(entry["methods"]))
-    needed = _ablation(experiments, entry["ablation"])
-    if needed.environment != entry["environment"]:
-        raise InputError(f"{source} draws {entry['environment']}, but its ablation is of {needed.environment}.")
+    needed = _ablation(experiments, entry["ablation"], entry["environment"])
     return FigureRequirements(needed.environment, (needed.method,), needed.name)
 
 
@@ -214,8 +212,7 @@ def _assemble(
         merged = _merge(merged, layer.values)
     if method in METHODS and environment in ENVIRONMENTS:
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(sections_of(method, environment)))
-        if environment != "yjunction":
-            merged["data"] = {**merged.get("data", {}), "yjunction": None}
+        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED) - {environment})}
     section, key = _LABEL
     if isinstance(merged.get(section), Mapping) and key in merged[section]:
         merged = _merge(merged, {section: {key: _pinned(merged[section][key], experiments)}})

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ssmail.shaping import AlphaDensity, AlphaPiece, Label
 
@@ -24,7 +24,7 @@ Pairing = Literal["start", "nearest", "assignment"]
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
 METHODS: tuple[str, ...] = get_args(Method)
-Environment = Literal["yjunction", "mocap"]
+Environment = Literal["yjunction", "letters", "mocap"]
 ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 
 _GAME = ("model", "adversarial", "sac", "curriculum", "training")
@@ -39,7 +39,8 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "constant-velocity": (),
     "copy-last": (),
 }  # the sections that a method has beside data and evaluation; the others are null in its spec
-ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "mocap": ("forecast",)}  # likewise
+ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "letters": (), "mocap": ("forecast",)}  # likewise
+GENERATED = ("yjunction", "letters")  # environments with a generator, whose parameters are data.ENVIRONMENT
 
 
 class Frozen(BaseModel):
@@ -72,11 +73,37 @@ class YJunctionSpec(Frozen):
     seed: NonNegativeCount
 
 
+MOST_LETTERS = 6
+
+
+def check_word(word: Any) -> Any:
+    """The word. Raises ValueError unless it is 1 to 6 capital letters."""
+    wanted = f"takes 1 to {MOST_LETTERS} capital letters A to Z"
+    if not isinstance(word, str):
+        raise ValueError(f"{wanted}; YAML reads NO, ON, YES and NULL as something else, unless in quotes as '\"NO\"'")
+    if not (1 <= len(word) <= MOST_LETTERS and word.isascii() and word.isalpha() and word.isupper()):
+        raise ValueError(f"{wanted}, not {word[:20]!r}")
+    return word
+
+
+class LettersSpec(Frozen):
+    """The word that is drawn and the size of the letters' expert set (sections 1 and A.2)."""
+
+    word: Annotated[str, BeforeValidator(check_word)]  # one agent for each letter
+    train: Count  # trajectories
+    validation: Count
+    test: Count
+    steps: Annotated[int, Field(ge=20)]
+    jitter: NonNegative  # scale of the hand's random starts, shapes, wobble and tempo; 1 is the default spread
+    seed: NonNegativeCount
+
+
 class DataSpec(Frozen):
     """Where the expert trajectories come from: a file, or (path null) the environment's generator."""
 
     path: str | None
     yjunction: YJunctionSpec | None  # null in other environments
+    letters: LettersSpec | None  # likewise
 
 
 class ModelSpec(Frozen):
@@ -100,6 +127,7 @@ class ModelSpec(Frozen):
     standardize: bool
     action_step: Positive  # an action moves a velocity by at most this much; scaled units if not standardize
     action_bound: Positive  # and never farther from 0 (with standardize: from the mean) than this
+    initial_scale: NonNegative  # of the actor's last weights: how far the untrained mean strays from the velocity
     log_std_min: Finite
     log_std_max: Finite
 
@@ -226,6 +254,9 @@ class EvaluationSpec(Frozen):
     samples: Count  # rollouts for each test start
     # an epoch whose validation lane_balance is below is best only while none reaches it
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
+    # landscapes of the reward that are kept, evenly over the epochs, beside those of the untrained and of the current
+    # model (training.landscapes); null: that of the last epoch alone
+    landscapes: Count | None
 
 
 class ForecastSpec(Frozen):
@@ -265,10 +296,11 @@ class RunSpec(Frozen):
             needed, given = name in sections_of(self.method, self.environment), getattr(self, name) is not None
             if needed != given:
                 what = f"{self.method} on {self.environment}"
-                raise ValueError(f"{what} {'needs' if needed else 'has no'} section {name}")
-        if self.environment == "yjunction" and self.data.yjunction is None:
-            raise ValueError("environment yjunction needs data.yjunction")
-        if self.environment != "yjunction" and self.data.path is None:
+                raise ValueError(f"{what} {_needs(needed)} section {name}")
+        for name in GENERATED:
+            if (getattr(self.data, name) is not None) != (name == self.environment):
+                raise ValueError(f"environment {self.environment} {_needs(name == self.environment)} data.{name}")
+        if self.environment not in GENERATED and self.data.path is None:
             raise ValueError(f"environment {self.environment} needs a data file; set data.path")
         return self
 
@@ -288,8 +320,8 @@ class RunSpec(Frozen):
         """
         values = self.model_dump(mode="json", exclude_none=True)
         for section, key, before in LATER:
-            if section in values and values[section][key] == before:
-                del values[section][key]
+            if section in values and values[section].get(key) == before:
+                values[section].pop(key, None)
         return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
 
     @classmethod
@@ -312,11 +344,19 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
     return whole
 
 
+def _needs(needed: bool) -> str:
+    return "needs" if needed else "has no"
+
+
 def _canonical(values: Any) -> str:
     return json.dumps(values, sort_keys=True, separators=(",", ":"))
 
 
-LATER: tuple[tuple[str, str, Any], ...] = (("self_supervision", "label", "identity"),)
+LATER: tuple[tuple[str, str, Any], ...] = (
+    ("self_supervision", "label", "identity"),
+    ("data", "letters", None),
+    ("model", "initial_scale", 0.1),
+)
 """(section, key, value) of what runs of earlier versions had without a name for it."""
 
 OPTIONAL_SECTIONS = tuple(

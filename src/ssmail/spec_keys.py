@@ -10,7 +10,16 @@ from pydantic import BaseModel, ValidationError
 
 from ssmail import strict_yaml
 from ssmail.errors import InputError
-from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
+from ssmail.spec import (
+    ENVIRONMENT_SECTIONS,
+    ENVIRONMENTS,
+    GENERATED,
+    METHODS,
+    OPTIONAL_SECTIONS,
+    SECTIONS,
+    RunSpec,
+    sections_of,
+)
 
 _ARGUMENTS = ("method", "environment", "profile")  # they come from build_spec's arguments, never from a mapping
 
@@ -50,8 +59,9 @@ def check_section(key: str, method: str, environment: str, source: str) -> None:
     if method not in METHODS or environment not in ENVIRONMENTS:
         return
     section = key.partition(".")[0]
-    if key.startswith("data.yjunction") and environment != "yjunction":
-        raise InputError(f"environment {environment} has no section 'data.yjunction' to set in {source}.")
+    for other in set(GENERATED) - {environment}:
+        if key == f"data.{other}" or key.startswith(f"data.{other}."):
+            raise InputError(f"environment {environment} has no section 'data.{other}' to set in {source}.")
     if section in OPTIONAL_SECTIONS and section not in sections_of(method, environment):
         tables = {**SECTIONS, **ENVIRONMENT_SECTIONS}
         users = ", ".join(name for name, sections in tables.items() if section in sections)

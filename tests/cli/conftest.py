@@ -85,16 +85,22 @@ def _end(cell: Cell, kind: Any, store: Store, report: Report) -> Event:
     epochs = cell.spec.epochs
     writer = store.start_run(cell.spec, cell.seed, dataset_hash="d" * 64, device="cpu", replace=True)
     report(Event("started", cell, writer.run_id, 0, epochs))
-    error = {"yjunction": "mode_mse", "mocap": "mse"}[cell.spec.environment]
+    error = {"yjunction": "mode_mse", "letters": "stroke_distance", "mocap": "mse"}[cell.spec.environment]
     for epoch in range(1, epochs + 1):
         metrics = {f"validation/{error}": 0.1 / epoch, "critic/loss": 0.5}
+        if cell.spec.environment == "letters":
+            metrics["validation/mse"] = 0.3  # which is shown of mocap
         writer.epoch(epoch, {**metrics, f"train/{error}": 0.2 / epoch})
         report(Event("epoch", cell, writer.run_id, epoch, epochs, metrics))
     if kind == "finished":
         writer.arrays(arrays(0.0))
         writer.final(epochs, _results(cell))
     writer.finish(RunState(kind), None if kind == "finished" else "the reason")
-    tested = {"test/mode_mse": 0.5} if cell.spec.environment == "yjunction" else {"test/mse_40": 0.25}
+    tested = {
+        "yjunction": {"test/mode_mse": 0.5},
+        "letters": {"test/stroke_distance": 0.125},
+        "mocap": {"test/mse_40": 0.25},
+    }[cell.spec.environment]
     last = Event(kind, cell, writer.run_id, epochs, epochs, tested, message="the reason")
     report(last)
     return last
@@ -105,5 +111,13 @@ def _results(cell: Cell) -> dict[str, float]:
     error = 0.001 * (1 + cell.seed)
     if cell.spec.environment == "yjunction":
         return {"test/mode_mse": error, "test/on_lane": 0.9, "test/lane_balance": 0.25}
+    if cell.spec.environment == "letters":
+        drawn = {f"{prefix}/stroke_distance": 12.3456 * error for prefix in ("test", "test_mean", "test_last")}
+        return {
+            **drawn,
+            "test_constant_velocity/stroke_distance": 0.812345,
+            "test/ade": 0.0456789,
+            "test/diverged": 0.0,
+        }
     clean = {f"test/mse_{h}": 1.23456 * error * h for h in (1, 10, 20, 40, 48)}
     return {**clean, "test_noisy/mse_40": 0.00123456, "test_constant_velocity/mse_40": 0.0456789, "test/diverged": 0.0}

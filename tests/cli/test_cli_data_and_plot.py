@@ -1,11 +1,11 @@
-"""`ssmail generate-yjunction` and `ssmail plot`."""
+"""`ssmail generate-yjunction`, `ssmail generate-letters` and `ssmail plot`."""
 
 import json
 from pathlib import Path
 
 import pytest
 
-from ssmail.data import expert_file, yjunction
+from ssmail.data import expert_file, letters, yjunction
 from ssmail.evaluation.statistics import Statistic
 from ssmail.experiments import build_spec
 from ssmail.figures import FIGURES, provenance
@@ -54,6 +54,31 @@ def test_every_option_reaches_the_generator(cli: CommandLine, tmp_path: Path) ->
     told = json.loads(outcome.out)
     assert told["parameters"] == wanted
     assert told["hash"] == expert_file.load(tmp_path / "set.npz").hash
+
+
+def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLine, tmp_path: Path) -> None:
+    out = tmp_path / "letters.npz"
+    assert cli("generate-letters", "--out", out).code == 0
+    params = build_spec("ssail", "letters", "quick").data.letters
+    assert params is not None
+    assert expert_file.load(out, "letters").hash == letters.generate(params).hash
+    wanted = {"word": "NO", "train": 3, "validation": 4, "test": 5, "steps": 40, "jitter": 0.5, "seed": 7}
+    options = [part for key, value in wanted.items() for part in (f"--{key}", value)]
+    told = json.loads(cli("generate-letters", "--out", out, "--force", "--json", *options).out)
+    assert told["parameters"] == {"environment": "letters", **wanted}  # NO is a word, though YAML reads "no" in it
+    read = expert_file.load(out, "letters")
+    assert told["hash"] == read.hash
+    made = letters.generate(params.model_copy(update=wanted))
+    assert made.hash == read.hash
+    assert (read.validation.continuations == made.validation.continuations).all()
+    assert "not of yjunction" in cli("train", "--set", f"data.path={out}", "--db", tmp_path / "x.db").sentence
+
+
+@pytest.mark.parametrize("word", ["ml", "TOOLONG", "", "M1", "1"])
+def test_a_bad_word(cli: CommandLine, tmp_path: Path, word: str) -> None:
+    sentence = cli("generate-letters", "--out", tmp_path / "letters.npz", "--word", word).sentence
+    assert sentence == f"data.letters.word: takes 1 to 6 capital letters A to Z, not {word!r}."
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_file_is_overwritten_only_with_force(cli: CommandLine, tmp_path: Path) -> None:

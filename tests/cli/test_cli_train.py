@@ -77,6 +77,46 @@ def test_results_are_rows_in_the_order_of_the_seeds(cli: CommandLine, fake: Fake
     assert [(row["seed"], row["test/mode_mse"], row["test/min_fde_20"]) for row in found] == [(5, 0.006, None)]
 
 
+def test_results_on_letters_have_their_own_columns(
+    cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    drawn = (*SMOKE, "--env", "letters", "--seeds", "0,6", "--db", db)
+    outcome = cli(*drawn)
+    assert float(outcome.rows[1]["test/stroke_distance"]) == pytest.approx(0.0864192)
+    assert "test/mode_mse" not in outcome.rows[1]
+    assert "seed 0: epoch 1/3  val 0.1  critic 0.5" in outcome.err.splitlines()
+    assert outcome.err.splitlines()[-1].endswith(": test error 0.125")
+    monkeypatch.setenv("COLUMNS", "90")
+    monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    table = cli(*drawn, "--resume", "never").out.splitlines()
+    assert max(map(len, table)) <= 90
+    headings = ["seed", "outcome", "run", "distance", "mean", "epoch", "ade", "velocity", "diverged", "seconds"]
+    assert table[1].split() == headings
+
+
+def test_a_real_training_on_letters(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    """From the command line to the table and the curve."""
+    word = ("--set", "data.letters.word=IT")
+    outcome = cli(*SMOKE, "--env", "letters", *word, "--db", db, "--json")
+    assert outcome.code == 0
+    (row,) = json.loads(outcome.out)
+    assert row["outcome"] == "finished"
+    assert 0 < row["test/stroke_distance"] < 2
+    (run,) = Store.open(db).runs()
+    assert Store.open(db).array(run.id, "test/rollouts").shape == (3, 16, 60, 2, 2)
+    drawn = cli("plot", "training", "--env", "letters", "--db", db, "--out", tmp_path / "figures")
+    assert drawn.code == 0
+    compared = cli("runs", "compare", "--db", db).rows
+    assert float(compared[0]["test/stroke_distance"]) == row["test/stroke_distance"]
+
+
+def test_a_word_that_cannot_be_drawn(cli: CommandLine, db: Path) -> None:
+    sentence = cli(*SMOKE, "--env", "letters", "--set", "data.letters.word=Hello", "--db", db).sentence
+    assert sentence == "data.letters.word: takes 1 to 6 capital letters A to Z, not 'Hello'."
+
+
 def test_results_on_mocap_have_its_own_columns(
     cli: CommandLine, fake: FakeTraining, db: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats
-from ssmail.evaluation.protocol import STEPS, forecast_metrics
+from ssmail.evaluation.protocol import STEPS, forecast_metrics, letter_metrics
 
 SCALING = Scaling(0.0, 10.0, -1.0, 1.0)  # one scaled unit of position is five raw ones
 S, B, T, N = 2, 2, 3, 1
@@ -90,3 +90,23 @@ def test_steps_have_metrics_of_their_own_as_far_as_there_are_so_many(steps: int,
     assert values["mse"] == pytest.approx(np.square(predicted - truth).mean())
     perfect, _ = forecast_metrics(truth[None], truth, SCALING)
     assert set(perfect.values()) == {0.0}
+
+
+def test_letter_metrics_of_each_agent_by_hand() -> None:
+    """Two agents, bars of length 1 (raw) at different heights: the first drawn 0.25 too high, the second exactly; what
+    comes before the letter's first step counts in the mse alone.
+    """
+    scaling = Scaling(0.0, 4.0, -1.0, 1.0)
+    bars = np.stack([np.stack([np.linspace(0, 1, 11), np.full(11, height)], axis=1) for height in (1.0, 3.0)])
+    raw = np.concatenate([np.full((3, 2, 2), 2.0), np.moveaxis(bars, 0, 1)])  # (T, N, 2), three steps on the way
+    truth = np.concatenate([scaling.scale_positions(raw), np.zeros_like(raw)], axis=-1)[None]
+    predicted = np.repeat(truth[None], 2, axis=0)
+    predicted[:, :, 3:, 0, 1] += 0.25 * 2 / scaling.position_span
+    values = letter_metrics(predicted, truth, bars, 3, scaling)
+    assert values["stroke_distance_0"] == pytest.approx(0.25)
+    assert values["stroke_distance_1"] == pytest.approx(0)
+    assert values["stroke_distance"] == pytest.approx(0.125)
+    assert values["mse"] == pytest.approx(0.125**2 * 11 / 13 / 8)
+    assert values["ade"] == pytest.approx(0.125 * 11 / 13)
+    early = letter_metrics(predicted, truth, bars, 0, scaling)  # negative control: with the way there
+    assert early["stroke_distance_1"] > 0.1

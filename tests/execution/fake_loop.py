@@ -22,6 +22,7 @@ class Walk:
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
         self.dataset_hash = "d" * 64
         self.epoch, self.improved, self.seed = 0, False, seed
+        self.snapshot: dict[str, np.ndarray] = {}
         self.generator = torch.Generator().manual_seed(seed)
         self.place = torch.zeros(3)
         self.best_error, self.best_place = math.inf, self.place

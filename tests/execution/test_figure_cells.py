@@ -52,6 +52,9 @@ def test_ranges_are_named_as_they_are_written() -> None:
     cells = figure_cells("fig8", "smoke", [0])
     assert [names["self_supervision.alpha"] for names in cells.values()] == [[0, 1], [-1, 1]]
     assert {cell.spec.environment for cell in cells} == {"mocap"}
+    elsewhere = figure_cells("fig2", "smoke", [0])
+    assert [names["self_supervision.alpha"] for names in elsewhere.values()] == [[0, 1], [-1, 1]]
+    assert {cell.spec.environment for cell in elsewhere} == {"letters"}
 
 
 def test_figures_share_equal_cells() -> None:

@@ -16,7 +16,7 @@ EPOCHS = 5
 
 
 def train(store: Store, seeds: Sequence[int] = (0,), loop: str = "ssmail.training.loop:TrainingLoop") -> list[Event]:
-    spec = build_spec("ssail", "yjunction", "smoke", [f"training.epochs={EPOCHS}"])
+    spec = build_spec("ssail", "yjunction", "smoke", [f"training.epochs={EPOCHS}", "evaluation.landscapes=5"])
     cells = [Cell(spec, seed) for seed in seeds]
     return run_cells(cells, store_url=store.url, on_event=lambda _: None, jobs=2, loop_factory=loop)
 
@@ -42,6 +42,8 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others(tmp_path: 
     assert {step for name, step in metrics if name == "validation/mode_mse"} == set(range(1, EPOCHS + 1))
     assert ("test/mode_mse", EPOCHS) in metrics
     assert "test/rollouts" in arrays
+    assert {f"landscape/{epoch:04d}/reward" for epoch in range(EPOCHS + 1)} <= arrays.keys()
+    assert ("landscape/cosine", EPOCHS) in metrics
     assert checkpoints.keys() == {"best.pt", "last.pt"}
     same, other = trained(tmp_path / "ssmail.db", [0, 1])
     assert same == undisturbed

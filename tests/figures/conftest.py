@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssmail.experiments import ablation_specs, build_spec
+from ssmail.experiments import ablation_specs, build_spec, figure_requirements
 from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store
 
 from .handmade_arrays import arrays, forecasts
+from .handmade_landscapes import landscapes, linear, vector_field
 
 AddRun = Callable[..., str]
 
@@ -20,7 +21,8 @@ def add_run(store: Store) -> AddRun:
     """add_run(seed, errors, state, ...) -> run id: one epoch for each error; a finished run has final results too.
 
     The spec is that of the method in profile smoke with `overrides`, or the given one. `epochs` holds more metrics, a
-    value for each epoch; `final` more final ones, and `extra` arrays in place of the handmade ones.
+    value for each epoch, `looks` metrics of some epochs; `final` more final ones, and `extra` arrays in place of the
+    handmade ones.
     """
 
     def add(
@@ -35,13 +37,15 @@ def add_run(store: Store) -> AddRun:
         shift: float = 0.0,
         epochs: Mapping[str, Sequence[float]] | None = None,
         final: Mapping[str, float] | None = None,
+        looks: Mapping[str, Mapping[int, float]] | None = None,
         **extra: np.ndarray,
     ) -> str:
         spec = spec or build_spec(method, "yjunction", "smoke", overrides)
         writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", replace=True)
         for epoch, error in enumerate(errors, start=1):
             more = {name: values[epoch - 1] for name, values in (epochs or {}).items()}
-            writer.epoch(epoch, {"train/mode_mse": error, "actor/loss": -1.0, **more})
+            seen = {name: values[epoch] for name, values in (looks or {}).items() if epoch in values}
+            writer.epoch(epoch, {"train/mode_mse": error, "actor/loss": -1.0, **more, **seen})
         if state is RunState.FINISHED:
             writer.arrays({**arrays(shift), **{name.replace("__", "/"): value for name, value in extra.items()}})
             results = {"test/on_lane": 0.9, "test/lane_balance": 0.25, "test_constant_velocity/mode_mse": 0.045}
@@ -141,5 +145,33 @@ def ablate(add_run: AddRun) -> AddRun:
             ]
             for value, errors in results.items()
         }
+
+    return add
+
+
+@pytest.fixture
+def add_landscapes(add_run: AddRun) -> AddRun:
+    """add_landscapes(seed, method, share, field=linear(), behind=0.5, ...) -> id of a run on the environment of figure
+    1, of three epochs in profile smoke, with handmade_landscapes: looked at before training and after epochs 1 and 3,
+    with slope shares of share / 2 and share, and cosines of half as much. `behind` None: it has no vector field.
+    """
+
+    def add(
+        seed: int = 0,
+        method: str = "ssail",
+        share: float = 0.8,
+        *,
+        field: tuple[np.ndarray, np.ndarray] | None = None,
+        behind: float | None = 0.5,
+        state: RunState = RunState.FINISHED,
+        overrides: Sequence[str] = (),
+    ) -> str:
+        spec = build_spec(method, figure_requirements("fig1").environment, "smoke", overrides)
+        found = landscapes(field or linear()) | ({} if behind is None else vector_field(behind))
+        shares = {1: share / 2, 3: share}
+        looks = {"landscape/slope_share": shares, "landscape/cosine": {e: s / 2 for e, s in shares.items()}}
+        if behind is not None:
+            looks |= {"landscape/behind_cosine": {1: behind}, "landscape/ahead_cosine": {1: 1.0}}
+        return add_run(seed, state=state, spec=spec, looks=looks, **found)
 
     return add

@@ -12,6 +12,10 @@ from ssmail.figures import FIGURES, style
 
 def test_names_and_aliases_lead_to_the_same_figure() -> None:
     assert {name: module.name for name, module in FIGURES.items()} == {
+        "fig1": "fig1",
+        "landscapes": "fig1",
+        "fig2": "fig2",
+        "vector-field": "fig2",
         "fig3": "fig3",
         "curricula": "fig3",
         "fig4": "fig4",

@@ -111,3 +111,16 @@ def test_log_probability_is_a_density() -> None:
             x.expand(4001, -1, -1), graph.expand(4001, -1, -1, -1), velocity.expand(4001, -1, -1), a
         ).exp()
     assert abs(float(torch.trapezoid(density.flatten(), a.flatten())) - 1) < 1e-2
+
+
+def test_the_untrained_mean_strays_from_the_velocity_by_the_initial_scale() -> None:
+    x, velocity, graph = torch.randn(2, 3, 5, 4), 0.1 * torch.randn(2, 3, 5, 2), one_hot_graph(2, 3, 5)
+
+    def stray(scale: float) -> float:
+        torch.manual_seed(0)
+        actor = Actor(4, 2, SPEC.model_copy(update={"initial_scale": scale}))
+        mean = actor.sample(x, graph, velocity, torch.zeros_like(velocity))
+        return float((mean - velocity).abs().mean().detach())
+
+    assert stray(0.0) == 0.0
+    assert 0 < stray(0.01) < 0.11 * stray(0.1)

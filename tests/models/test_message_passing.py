@@ -29,6 +29,7 @@ SPEC = ModelSpec(
     standardize=False,
     action_step=0.3,
     action_bound=1.5,
+    initial_scale=0.1,
     log_std_min=-5.0,
     log_std_max=0.0,
     root_relative=False,

@@ -2,9 +2,9 @@
 
 The parameters name the environment of the set (yjunction, where they do not). All sets hold `parameters` and `hash`,
 and for each split `positions`, `velocities` and `mode`. A yjunction set holds in addition its `continuations` and
-`centre_lines`; a mocap set the `trial` and first `frame` of each window, the `joints` and `parents` of its skeleton,
-the `scaling` [position_min, position_max, velocity_min, velocity_max] of its training split, and the checksums of its
-`sources`. Nothing in it is pickled.
+`centre_lines`, a letters set the `centre_lines` alone; a mocap set the `trial` and first `frame` of each window, the
+`joints` and `parents` of its skeleton, the `scaling` [position_min, position_max, velocity_min, velocity_max] of its
+training split, and the checksums of its `sources`. Nothing in it is pickled.
 """
 
 import contextlib
@@ -19,11 +19,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ssmail.data import letters
 from ssmail.data.mocap import dataset as mocap
-from ssmail.data.trajectories import ExpertSet, Trajectories
-from ssmail.data.yjunction import LANES, SPLITS, make_expert_set
+from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
+from ssmail.data.yjunction import LANES, make_expert_set
 from ssmail.errors import InputError
-from ssmail.spec import YJunctionSpec
+from ssmail.spec import LettersSpec, YJunctionSpec
 
 Contents = Mapping[str, Any]
 
@@ -176,6 +177,22 @@ def _read_yjunction(file: _File) -> ExpertSet:
     return make_expert_set(splits, file.contents["centre_lines"], params)
 
 
+def _read_letters(file: _File) -> ExpertSet:
+    parameters = json.loads(str(file.contents["parameters"]))
+    parameters.pop("environment")
+    params = LettersSpec.model_validate(parameters)
+    splits = {}
+    for split in SPLITS:
+        count = getattr(params, split)
+        shape = (count, params.steps, len(params.word), 2)
+        file.array(f"{split}/mode", (count,), np.int64)
+        splits[split] = letters.make_trajectories(
+            file.array(f"{split}/positions", shape, np.float64), file.array(f"{split}/velocities", shape, np.float64)
+        )
+    lines = file.array("centre_lines", (len(params.word), letters.POINTS, 2), np.float64)
+    return letters.make_expert_set(splits, lines, params)
+
+
 def _mocap_arrays(experts: ExpertSet) -> dict[str, Any]:
     scaling = experts.scaling
     ranges = (scaling.position_min, scaling.position_max, scaling.velocity_min, scaling.velocity_max)
@@ -218,6 +235,7 @@ KINDS = {
         ("centre_lines",),
         _read_yjunction,
     ),
+    "letters": _Kind("ssmail generate-letters", ("positions", "velocities", "mode"), ("centre_lines",), _read_letters),
     "mocap": _Kind(
         "ssmail prep-mocap",
         ("positions", "velocities", "mode", "trial", "frame"),

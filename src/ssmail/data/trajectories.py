@@ -10,6 +10,7 @@ from ssmail.data.scaling import Scaling
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
+SPLITS = ("train", "validation", "test")
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,8 @@ class Trajectories:
 class ExpertSet:
     """The three splits of an environment's expert data, with what identifies them.
 
-    centre_lines: (L, P', P) points of each mode's centre line in raw units; empty where there is none.
+    centre_lines: (L, P', P) points of each mode's centre line in raw units; of letters, (N, P', P) the letter that each
+    agent draws; empty where there is none.
     parameters: what made the set; its "environment", where absent, is yjunction.
     hash: SHA-256 of the arrays and of the parameters that made them, and of the skeleton.
     joints, parents: names of the N agents where they are the joints of a skeleton, and for each the one that it hangs

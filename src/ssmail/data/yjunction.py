@@ -12,7 +12,7 @@ import json
 
 import numpy as np
 
-from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories
+from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError
 from ssmail.spec import YJunctionSpec
 
@@ -21,7 +21,6 @@ FORK = 0.3  # where the lanes part, as a fraction of the number of steps
 FILE = 0.16  # length of the file of agents, same unit
 ARC = 0.12  # length of the bend, same unit
 SPREADS = {"start": 2.0, "gap": 0.75, "speed": 0.05, "offset": 0.6}  # half-widths of the uniform draws at jitter 1
-SPLITS = ("train", "validation", "test")
 
 
 def generate(params: YJunctionSpec) -> ExpertSet:

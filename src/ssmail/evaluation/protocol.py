@@ -5,6 +5,7 @@ import numpy as np
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Trajectories
 from ssmail.evaluation import metrics
+from ssmail.evaluation.strokes import stroke_distances
 
 
 def quick_metrics(predicted: Floats, truth: Trajectories, centre_lines: Floats, scaling: Scaling) -> dict[str, float]:
@@ -77,3 +78,20 @@ def forecast_metrics(
     values["diverged"] = metrics.diverged(predicted[..., :axes].reshape(-1, *predicted.shape[2:-1], axes))
     spread = windows.std(axis=0, ddof=1) if len(windows) > 1 else np.full(len(curve), np.nan)
     return values, {"mse": curve.astype(np.float64), "mse_spread": spread.astype(np.float64)}
+
+
+def letter_metrics(
+    predicted: Floats, truth: Floats, letters: Floats, first_letter_step: int, scaling: Scaling
+) -> dict[str, float]:
+    """The metrics of drawn letters.
+
+    predicted (S, B, T, N, 4) and truth (B, T, N, 4) are scaled states, the start included; letters (N, P', 2) raw
+    polylines. mse, mse_h, ade, fde and diverged as in `forecast_metrics`, of the predicted steps 1 .. T - 1.
+    stroke_distance in letter heights (the raw unit), mean over samples, starts and agents, and stroke_distance_n of
+    agent n = 0 .. N - 1: of the states from `first_letter_step` on.
+    """
+    values, _ = forecast_metrics(predicted[:, :, 1:], truth[:, 1:], scaling)
+    drawn = scaling.unscale_positions(predicted[:, :, first_letter_step:, :, :2])
+    found = stroke_distances(drawn.reshape(-1, *drawn.shape[2:]), letters).mean(axis=0)  # (N,)
+    values["stroke_distance"] = float(found.mean())
+    return values | {f"stroke_distance_{n}": float(distance) for n, distance in enumerate(found)}

@@ -21,8 +21,8 @@ def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> dict[Cell, 
         for method in needed.methods:
             specs.append((build_spec(method, needed.environment, profile), {"method": method}))
     else:
-        varied = ablation(needed.ablation)
-        for value, spec in ablation_specs(varied.name, profile).items():
+        varied = ablation(needed.ablation, needed.environment)
+        for value, spec in ablation_specs(varied.name, profile, environment=varied.environment).items():
             specs.append((spec, {"method": varied.method, varied.key: as_written(value)}))
     return {Cell(spec, seed): {**names, "seed": seed} for spec, names in specs for seed in seeds}
 

@@ -3,11 +3,12 @@
 import importlib
 import threading
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ssmail.errors import InputError, SsmailError
@@ -85,6 +86,7 @@ def _train(
     should_stop: Callable[[], bool],
 ) -> Event:
     epochs = cell.spec.epochs
+    _keep(writer, loop.snapshot)
     while loop.epoch < epochs:
         if should_stop():
             writer.finish(RunState.INTERRUPTED, f"stopped after epoch {loop.epoch}")
@@ -96,6 +98,7 @@ def _train(
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
+        _keep(writer, loop.snapshot)
         if loop.improved:
             save_checkpoint(folder / BEST, loop.best_state_dict())
         save_checkpoint(folder / LAST, loop.state_dict())  # last: a checkpoint never runs ahead of the metrics
@@ -106,6 +109,12 @@ def _train(
     _record_checkpoints(writer, folder)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
+
+
+def _keep(writer: RunWriter, snapshot: Mapping[str, np.ndarray]) -> None:
+    """Store the arrays of an epoch, before its checkpoint: after a kill they are computed again, to the same bits."""
+    if snapshot:
+        writer.arrays(snapshot)
 
 
 def _record_checkpoints(writer: RunWriter, folder: Path) -> None:

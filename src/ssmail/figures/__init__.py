@@ -1,5 +1,5 @@
-"""The figures of the paper, redrawn from the store alone; `training_curves`, for questions that it does not ask; and
-`skeleton`, a picture of the motion-capture data.
+"""The figures of the paper, redrawn from the store alone; `training_curves` and `landscape_film`, for questions that it
+does not ask; and `skeleton`, a picture of the motion-capture data.
 
 Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
 Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.
@@ -59,7 +59,7 @@ class FigureModule:
     @property
     def stem(self) -> str:
         """The name of the module and, without the ending, of the files that are saved."""
-        return f"{self.name}_{self.alias}"
+        return f"{self.name}_{self.alias}".replace("-", "_")
 
     def collect(
         self,
@@ -91,6 +91,8 @@ class FigureModule:
 
 
 _MODULES = (
+    FigureModule("fig1", "landscapes", "letters: the task, and the reward over the plane, ideal and learned"),
+    FigureModule("fig2", "vector-field", "letters: the learned reward's gradient around the current trajectory"),
     FigureModule("fig3", "curricula", "segment lengths over epochs, under each curriculum", has_statistic=True),
     FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),

@@ -45,13 +45,13 @@ def select_ablation(
     """The runs that `figure` draws, a group for each value of the ablation's key, in rising or the file's order.
 
     They are those of `ids`, or the default choice among the stored ones of `profile` (or any), on `environment` (or the
-    ablation's own). Raises NoRuns when none is stored, InputError when an id is unknown or of another environment, when
+    figure's own). Raises NoRuns when none is stored, InputError when an id is unknown or of another environment, when
     the given runs differ in more than the key, and when the chosen ones were trained on different data.
     """
-    name = figure_requirements(figure).ablation
-    if name is None:
+    entry = figure_requirements(figure)
+    if entry.ablation is None:
         raise InputError(f"figures.{figure} of experiments.yaml names no ablation; add one, such as beta.")
-    needed = ablation(name, environment)
+    needed = ablation(entry.ablation, environment or entry.environment)
     if ids:
         runs = runs_of(store, figure, needed.environment, ids)
         _check_one_family(figure, needed.key, runs)

@@ -35,8 +35,8 @@ class Actor(nn.Module):
         self.head = perceptron(spec.hidden + inputs * spec.own_input, spec.hidden, 2 * action_size)
         last = self.head[-1]
         assert isinstance(last, nn.Linear)
-        with torch.no_grad():  # the untrained policy drives straight on
-            last.weight.mul_(0.1)
+        with torch.no_grad():  # the untrained policy drives straight on, nearly
+            last.weight.mul_(spec.initial_scale)
             last.bias.zero_()
 
     def distribution(self, x: Tensor, graph: Tensor) -> tuple[Tensor, Tensor]:

@@ -44,13 +44,13 @@ class Features:
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
         """states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) -> (B, T, N, F)."""
         b, t, n, _ = states.shape
-        parts = [self._read(states)]
+        parts = [self.read(states)]
         if self.time:
             steps = torch.arange(first_step, first_step + t, dtype=states.dtype, device=states.device)
             scaled = 2 * steps / (self.steps - 1) - 1
             parts.append(scaled.view(1, t, 1, 1).expand(b, t, n, 1))
         if self.start:
-            parts.append(self._read(start).unsqueeze(1).expand(b, t, n, -1))
+            parts.append(self.read(start).unsqueeze(1).expand(b, t, n, -1))
         if self.agents:
             parts.append(torch.eye(n, dtype=states.dtype, device=states.device).expand(b, t, n, n))
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
@@ -63,7 +63,7 @@ class Features:
         """Actions (..., N, A) in scaled units from what a network says in those that it reads."""
         return read if self.standards is None else self.standards.velocity.restore(read)
 
-    def _read(self, states: Tensor) -> Tensor:
+    def read(self, states: Tensor) -> Tensor:
         """States (..., N, 2P) in the units that they are read in."""
         relative = self._relative(states)
         return relative if self.standards is None else self.standards.standardize(relative)

@@ -39,7 +39,7 @@ class GraphEncoder(nn.Module):
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
         embedded, memory = remember(self.lstm, off_diagonal(edges).transpose(0, 1).flatten(1, 2), memory)
-        logits = self.head(embedded).view(t, b, n * (n - 1), -1).transpose(0, 1)
+        logits = self.head(embedded).view(t, b, n * (n - 1), self.head.out_features).transpose(0, 1)
         return on_diagonal(logits, n), memory
 
 

@@ -75,7 +75,7 @@ class Store:
             needed = figure_requirements(figure)
             conditions += [run.c.environment == needed.environment, run.c.method.in_(list(needed.methods))]
             if needed.ablation is not None:
-                conditions.append(run.c.spec_hash.in_(ablation_hashes(needed.ablation)))
+                conditions.append(run.c.spec_hash.in_(ablation_hashes(needed.ablation, needed.environment)))
         with reading(self._engine) as connection:
             if ids is not None:
                 conditions.append(run.c.id.in_(queries.resolve(connection, ids)))

@@ -119,9 +119,7 @@ class AdversarialLearner:
     def update(self, latest: Batch, *, actor_learns: bool = True) -> dict[str, float]:
         """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
         logs = [self._update_discriminator(latest) for _ in range(self.adversarial.updates)]
-        values = self.actor_critic.update(
-            self._actor_batch(), self._pick_steps, self._reward, actor_learns=actor_learns
-        )
+        values = self.actor_critic.update(self._actor_batch(), self._pick_steps, self.reward, actor_learns=actor_learns)
         return mean_of(logs) | {name: float(value.detach()) for name, value in values.items()}
 
     def _update_discriminator(self, latest: Batch) -> dict[str, float]:
@@ -170,7 +168,10 @@ class AdversarialLearner:
         mixed, _ = self._mixed(generated[torch.arange(count)], self.supervision, self.supervision.actor_pairing)
         return Batch.concatenate([mixed, generated[torch.arange(count, len(generated))]])
 
-    def _reward(self, x: Tensor, actions: Tensor) -> Tensor:
+    def reward(self, x: Tensor, actions: Tensor) -> Tensor:
+        """(..., N) what the actor-critic is given for features x (..., N, F) and actions (..., N, A): the method's
+        reward with today's discriminator, scaled and limited.
+        """
         reward = self.adversarial.reward_scale * self.game.reward(self.discriminator(x, actions))
         limit = self.adversarial.reward_limit
         return reward if limit is None else reward.clamp(-limit, limit)

@@ -8,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
-from ssmail.evaluation.protocol import forecast_metrics, full_metrics, one_step_mse, quick_metrics
+from ssmail.evaluation.protocol import forecast_metrics, full_metrics, letter_metrics, one_step_mse, quick_metrics
 from ssmail.spec import RunSpec, used
 from ssmail.training.experts import scaled_batch
 from ssmail.training.learning import Predictor, Setting
@@ -34,6 +35,10 @@ class Evaluator(Protocol):
         """The metrics on the test split, and the arrays to draw."""
         ...
 
+    def beginning(self, untrained: Predictor) -> Arrays:
+        """The arrays to draw of a predictor before its first epoch; may be none."""
+        ...
+
 
 def make_evaluator(spec: RunSpec, data: ExpertSet, setting: Setting) -> Evaluator:
     """That of the spec's environment."""
@@ -49,6 +54,10 @@ class _Evaluator:
         self.generator = setting.generators["evaluation"]
         self.validation_states = scaled_batch(data.validation, self.scaling, self.device).states
         self.reference = ConstantVelocity(setting.integrator)
+
+    def beginning(self, untrained: Predictor) -> Arrays:
+        """None."""
+        return {}
 
     def some_training_trajectories(self) -> Tensor:
         """Indices of spec.evaluation.train_rollouts training trajectories, drawn anew in every epoch."""
@@ -135,6 +144,87 @@ class LaneEvaluator(_Evaluator):
         s = samples or self.spec.evaluation.samples
         positions = self._free_run(predictor, states[:, :1].repeat(s, 1, 1, 1), deterministic)
         return positions.reshape(s, len(states), *positions.shape[1:])
+
+
+class LetterEvaluator(_Evaluator):
+    """Letters: free-running from the first state, judged by the distance to the letter that was meant."""
+
+    STARTS = 16  # test starts from which the untrained predictor is rolled out
+
+    def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
+        super().__init__(spec, data, setting)
+        self.begin = first_letter_step(data.train.positions.shape[1])
+
+    def epoch(self, predictor: Predictor) -> dict[str, float]:
+        """One sampled rollout from every validation start and from some training starts."""
+        trained = self.setting.experts.states[self.some_training_trajectories().to(self.device)]
+        truth = torch.cat([self.validation_states, trained])
+        made = predictor.free_run(truth[:, :1], self.setting.steps, self.generator)
+        values: dict[str, float] = {}
+        parts = {"validation": slice(len(self.validation_states)), "train": slice(len(self.validation_states), None)}
+        for split, part in parts.items():
+            measured = self._measure(made[None, part], truth[part])
+            values |= {f"{split}/{name}": value for name, value in measured.items()}
+        return values
+
+    def rank(self, values: dict[str, float]) -> tuple[bool, float]:
+        """The smallest validation stroke_distance.
+
+        It is what the letters are judged by. The mse also asks for the tempo, and prefers a vague letter in time to a
+        clear one that comes late.
+        """
+        error = values["validation/stroke_distance"]
+        return not math.isfinite(error), error
+
+    def final(self, best: Predictor, last: Predictor) -> tuple[dict[str, float], Arrays]:
+        """The model of best validation, sampled and by its mean; the last model; constant velocity; the expert."""
+        truth = self.states(self.data.test)
+        sampled = self._samples(best, truth)
+        candidates = {
+            "test": sampled,
+            "test_mean": self._samples(best, truth, deterministic=True),
+            "test_last": self._samples(last, truth),
+            "test_constant_velocity": self._samples(self.reference, truth, samples=1),
+        }
+        values: dict[str, float] = {}
+        for prefix, samples in candidates.items():
+            measured = self._measure(samples, truth)
+            values |= {f"{prefix}/{name}": value for name, value in measured.items()}
+        for prefix, predictor in {"test": best, "test_constant_velocity": self.reference}.items():
+            values[f"{prefix}/one_step_mse"] = self.one_step(predictor, truth)
+        expert = self._measure(truth[None], truth)
+        values |= {f"test_expert/{name}": value for name, value in expert.items() if "stroke" in name}
+        return values, {
+            "test/rollouts": self.raw_positions(sampled).astype(np.float32),
+            "test/expert": self.data.test.positions.astype(np.float32),
+            "train/expert": self.data.train.positions.astype(np.float32),
+            "letters": self.data.centre_lines.astype(np.float32),
+            "first_letter_step": np.array([self.begin]),
+        }
+
+    def beginning(self, untrained: Predictor) -> Arrays:
+        """One sampled rollout, and one by its mean, from each of the first test starts. Nothing is drawn from the
+        evaluation's generator.
+        """
+        starts = self.states(self.data.test)[: self.STARTS, :1]
+        made = {}
+        for name, deterministic in (("initial", False), ("initial_mean", True)):
+            generator = torch.Generator().manual_seed(self.setting.generators.seeds["evaluation"])
+            states = untrained.free_run(starts, self.setting.steps, generator, deterministic=deterministic)
+            made[f"{name}/rollouts"] = self.raw_positions(states).astype(np.float32)
+        return made
+
+    def _samples(
+        self, predictor: Predictor, states: Tensor, deterministic: bool = False, samples: int | None = None
+    ) -> Tensor:
+        """(S, B, T, N, D) scaled states: S rollouts of every start, spec.evaluation.samples by default."""
+        s = samples or self.spec.evaluation.samples
+        starts = states[:, :1].repeat(s, 1, 1, 1)
+        made = predictor.free_run(starts, self.setting.steps, self.generator, deterministic=deterministic)
+        return made.reshape(s, *states.shape)
+
+    def _measure(self, predicted: Tensor, truth: Tensor) -> dict[str, float]:
+        return letter_metrics(_numpy(predicted), _numpy(truth), self.data.centre_lines, self.begin, self.scaling)
 
 
 class ForecastEvaluator(_Evaluator):
@@ -235,5 +325,6 @@ def _numpy(states: Tensor) -> Floats:
 
 EVALUATORS: dict[str, Callable[[RunSpec, ExpertSet, Setting], Evaluator]] = {
     "yjunction": LaneEvaluator,
+    "letters": LetterEvaluator,
     "mocap": ForecastEvaluator,
 }

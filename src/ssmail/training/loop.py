@@ -14,13 +14,14 @@ import numpy as np
 import torch
 
 from ssmail.data.expert_file import load
+from ssmail.data.generators import generate
 from ssmail.data.trajectories import ExpertSet
-from ssmail.data.yjunction import generate
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
-from ssmail.spec import RunSpec, used
+from ssmail.spec import RunSpec
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.experts import scaled_batch
+from ssmail.training.landscapes import Landscapes, looks
 from ssmail.training.learning import Setting
 from ssmail.training.methods import make_learner
 from ssmail.training.seeding import Generators
@@ -32,13 +33,16 @@ class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fau
 
 def expert_set(spec: RunSpec) -> ExpertSet:
     """The expert data of a spec: its file, or the generator's set when it names none."""
-    if spec.data.path is None:
-        return generate(used(spec.data.yjunction))
-    return load(Path(spec.data.path), spec.environment)
+    if spec.data.path is not None:
+        return load(Path(spec.data.path), spec.environment)
+    return generate(spec.data)
 
 
 class TrainingLoop:
-    """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`."""
+    """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`.
+
+    `snapshot` holds the arrays to keep of the epoch that has just ended, or of the untrained model; mostly none.
+    """
 
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
         self.spec, self.device = spec, torch.device(device)
@@ -57,6 +61,10 @@ class TrainingLoop:
         self.best_error = math.inf
         self.best_epoch = 0
         self.best_weights = deepcopy(self.learner.predictor.state_dict())
+        self.untrained = deepcopy(self.learner.predictor)
+        self.landscapes = Landscapes.of(setting, self.learner)
+        self.snapshot: dict[str, np.ndarray] = {}
+        self._look()
 
     def run_epoch(self) -> dict[str, float]:
         """One epoch of training and its validation; returns the epoch's metrics. Raises Divergence when weights stop
@@ -68,7 +76,16 @@ class TrainingLoop:
         values |= self.evaluator.epoch(self.learner.predictor)
         self.epoch += 1
         self._select(*self.evaluator.rank(values))
+        values |= self._look()
         return values | {"seconds": time.perf_counter() - began}
+
+    def _look(self) -> dict[str, float]:
+        """Look at the learned reward, if this is an epoch for it: the numbers; the arrays are `snapshot`."""
+        values: dict[str, float] = {}
+        self.snapshot = {}
+        if self.landscapes is not None and self.epoch in looks(self.spec):
+            values, self.snapshot = self.landscapes.look(self.epoch)
+        return values
 
     def _select(self, flawed: bool, error: float) -> None:
         """Keep this epoch's model if it is the best so far by the evaluator's rank."""
@@ -82,7 +99,7 @@ class TrainingLoop:
         best = deepcopy(self.learner.predictor)
         best.load_state_dict(self.best_weights)
         values, arrays = self.evaluator.final(best, self.learner.predictor)
-        return {"best_epoch": float(self.best_epoch), **values}, arrays
+        return {"best_epoch": float(self.best_epoch), **values}, {**arrays, **self.evaluator.beginning(self.untrained)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue as if never interrupted: tensors and plain data only."""
@@ -100,7 +117,7 @@ class TrainingLoop:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`, for a loop made with the same spec and seed."""
-        self.epoch = state["epoch"]
+        self.epoch, self.snapshot = state["epoch"], {}
         best = state["best"]
         self.best_flawed, self.best_error = best["flawed"], best["error"]
         self.best_epoch, self.best_weights = best["epoch"], best["weights"]

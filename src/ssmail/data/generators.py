@@ -1,0 +1,16 @@
+"""The environments that make their own expert sets."""
+
+from ssmail.data import letters, yjunction
+from ssmail.data.trajectories import ExpertSet
+from ssmail.spec import DataSpec
+
+
+def generate(data: DataSpec) -> ExpertSet:
+    """The expert set of the environment whose parameters `data` has: one of ssmail.spec.GENERATED.
+
+    Raises InputError for parameters that no set can have.
+    """
+    if data.letters is not None:
+        return letters.generate(data.letters)
+    assert data.yjunction is not None
+    return yjunction.generate(data.yjunction)

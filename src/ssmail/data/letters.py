@@ -1,0 +1,159 @@
+"""The letters expert (sections 1, A.2): one agent for each letter of a word, drawing it in the plane.
+
+Lengths are in letter heights, time in steps. Letters stand side by side on the line y = 0 in the upper half of the
+picture. A pen begins in the lower half, below its letter, with a small velocity to the right: a policy that keeps its
+velocity draws a short line there. The expert leads the pen up to the beginning of the letter in the first LEAD of the
+time and then draws it in one stroke (ssmail.data.pen). The strokes are data: strokes.yaml.
+
+The jitter of a hand: where a pen begins and how fast, how large and how slanted the letter is, a smooth wobble, and the
+tempo. Only the beginning shows in the first state, so no policy can know the rest of one trajectory's jitter.
+"""
+
+import functools
+import hashlib
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ssmail import strict_yaml
+from ssmail.data.pen import Timeline, along, approach, arc_lengths, progress
+from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
+from ssmail.spec import LettersSpec
+
+WIDTH, GAP = 0.8, 0.4  # of a letter and between letters
+START = np.array([0.2, -0.55])  # where a pen begins, from the lower left corner of its letter
+LINE = 0.4  # length of the line that a pen draws when it keeps its first velocity
+LEAD = 0.24  # share of the time that leads the pen to the letter
+REST = 0.3  # of the lead is still to come when the letter's own motion begins, so that the pen does not stop there
+WAVES = 3  # sine waves in a wobble
+# half-widths of the uniform draws at jitter 1: lengths; scale, pace and tempo as fractions; slant as x per y
+SPREADS = {"start": 0.06, "pace": 0.25, "scale": 0.04, "slant": 0.06, "wobble": 0.02, "tempo": 0.08}
+POINTS = 120  # of the polyline of a letter
+
+
+def generate(params: LettersSpec) -> ExpertSet:
+    """The expert set of these parameters; equal parameters give equal arrays."""
+    counts = (params.train, params.validation, params.test)
+    seeds = np.random.SeedSequence(params.seed).spawn(len(SPLITS))
+    splits = {
+        name: _split(params, count, np.random.default_rng(seed))
+        for name, count, seed in zip(SPLITS, counts, seeds, strict=True)
+    }
+    return make_expert_set(splits, letter_lines(params), params)
+
+
+def make_expert_set(splits: dict[str, Trajectories], letters: Floats, params: LettersSpec) -> ExpertSet:
+    """Bundle the splits and the polylines of the letters (N, P', 2) with their parameters and the hash of it all."""
+    parameters = {"environment": "letters", **params.model_dump(mode="json")}
+    digest = hashlib.sha256(json.dumps(parameters, sort_keys=True).encode())
+    arrays = [array for s in SPLITS for array in (splits[s].positions, splits[s].velocities, splits[s].mode)]
+    for array in (*arrays, letters):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    train, validation, test = (splits[split] for split in SPLITS)
+    return ExpertSet(train, validation, test, letters, parameters, digest.hexdigest())
+
+
+def make_trajectories(positions: Floats, velocities: Floats) -> Trajectories:
+    """Trajectories (B, T, N, 2) of a single mode, whose continuation is the trajectory itself."""
+    return Trajectories(positions, velocities, np.zeros(len(positions), dtype=np.int64), positions[None])
+
+
+@functools.cache
+def strokes() -> dict[str, Floats]:
+    """(P, 2) polyline of each capital letter, as wide as a letter is."""
+    read = strict_yaml.read(Path(__file__).with_name("strokes.yaml"))
+    return {letter: np.array(points, dtype=np.float64) * [WIDTH, 1.0] for letter, points in read.items()}
+
+
+def corners(params: LettersSpec) -> Floats:
+    """(N, 2) lower left corner of each letter's box, WIDTH wide and 1 high."""
+    return np.stack([np.arange(len(params.word)) * (WIDTH + GAP), np.zeros(len(params.word))], axis=1)
+
+
+def first_letter_step(steps: int) -> int:
+    """The first of the `steps` states that belong to the letter and not to the way there."""
+    return math.ceil(_lead(steps) * (1 - REST / 2))
+
+
+def letter_lines(params: LettersSpec) -> Floats:
+    """(N, POINTS, 2) each letter as it is drawn without jitter, at equal distances along the line."""
+    fine = np.linspace(_lead(params.steps) * (1 - REST / 2), params.steps - 1, 2000)
+    drawn = _positions(params, fine[None], _still(params, 1))[0]  # (2000, N, 2)
+    lines = np.moveaxis(drawn, 1, 0)
+    return np.stack([_evenly(line) for line in lines])
+
+
+def _evenly(line: Floats) -> Floats:
+    """POINTS points at equal distances along a polyline (P, 2)."""
+    lengths = arc_lengths(line)
+    return along(line, lengths, np.linspace(0.0, lengths[-1], POINTS))
+
+
+def _lead(steps: int) -> float:
+    """Steps that lead the pen to the letter."""
+    return LEAD * (steps - 1)
+
+
+Jitter = dict[str, Floats]
+
+
+def _still(params: LettersSpec, count: int) -> Jitter:
+    """No jitter: zeros, (B, N, ...) for each name in SPREADS and for the waves of the wobble."""
+    n = len(params.word)
+    shapes = {"start": (2,), "pace": (), "scale": (), "slant": (), "tempo": (), "wobble": (WAVES, 2)}
+    return {name: np.zeros((count, n, *shape)) for name, shape in shapes.items()} | {
+        "phase": np.zeros((count, n, WAVES, 2))
+    }
+
+
+def _jitter(params: LettersSpec, count: int, rng: np.random.Generator) -> Jitter:
+    zeros = _still(params, count)
+    drawn = {name: rng.uniform(-1, 1, zeros[name].shape) * (SPREADS[name] * params.jitter) for name in SPREADS}
+    return drawn | {"phase": rng.uniform(0, 2 * np.pi, zeros["phase"].shape)}
+
+
+def _split(params: LettersSpec, count: int, rng: np.random.Generator) -> Trajectories:
+    """`count` trajectories, each with its own jitter of each pen."""
+    times = np.tile(np.arange(-1.0, params.steps), (count, 1))  # one step before the first state, for its velocity
+    positions = _positions(params, times, _jitter(params, count, rng))
+    return make_trajectories(positions[:, 1:], np.diff(positions, axis=1))
+
+
+def _positions(params: LettersSpec, times: Floats, jitter: Jitter) -> Floats:
+    """(B, T, N, 2) positions of all pens at `times` (B, T)."""
+    pens = []
+    for n, (letter, box) in enumerate(zip(params.word, corners(params), strict=True)):
+        own = {name: value[:, n] for name, value in jitter.items()}
+        pens.append(_pen(strokes()[letter], box, params.steps, times, own))
+    return np.stack(pens, axis=2)
+
+
+def _pen(stroke: Floats, box: Floats, steps: int, times: Floats, jitter: Jitter) -> Floats:
+    """(B, T, 2) positions of one pen, whose letter has its lower left corner at `box` (2,)."""
+    end, lead = steps - 1, _lead(steps)
+    share = np.clip(times / end, 0.0, 1.0)
+    warped = times + jitter["tempo"][:, None] * end * np.sin(np.pi * share) / np.pi  # equal at both ends
+    letter = Timeline.of(stroke, lead * (1 - REST), end).positions(warped)  # (B, T, 2)
+    letter, first = (_shaped(points, box, jitter) for points in (letter, np.broadcast_to(stroke[0], letter.shape)))
+    velocity = np.stack([LINE / end * (1 + jitter["pace"]), np.zeros(len(times))], axis=-1)
+    led = approach(box + START + jitter["start"], velocity, first[:, 0], warped, lead)
+    return led + letter - first + _wobble(share, jitter) * progress(share / LEAD)[..., None]
+
+
+def _shaped(points: Floats, box: Floats, jitter: Jitter) -> Floats:
+    """Points (B, T, 2) of a stroke in its place, scaled about the middle of its foot and slanted."""
+    middle = np.array([WIDTH / 2, 0.0])
+    centred = (points - middle) * (1 + jitter["scale"][:, None, None])
+    slanted = centred[..., 0] + jitter["slant"][:, None] * centred[..., 1]
+    shaped: Floats = np.stack([slanted, centred[..., 1]], axis=-1) + middle + box
+    return shaped
+
+
+def _wobble(share: Floats, jitter: Jitter) -> Floats:
+    """(B, T, 2) a few slow waves with the amplitudes of the jitter, at a share (B, T) of the time."""
+    wave = np.arange(1, WAVES + 1)[:, None]
+    angle = 2 * np.pi * wave * share[:, :, None, None] + jitter["phase"][:, None]  # (B, T, WAVES, 2)
+    waves: Floats = (jitter["wobble"][:, None] * np.sin(angle)).sum(axis=2) / np.sqrt(WAVES)
+    return waves

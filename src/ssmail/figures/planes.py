@@ -1,0 +1,157 @@
+"""Landscapes as a run stored them (docs/database.md): reading them, joining the planes of the agents, drawing one."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.image import AxesImage
+
+from ssmail.data.trajectories import Floats, Integers
+from ssmail.errors import InputError
+from ssmail.evaluation.landscape import Plane, nearest_points, slope_share
+from ssmail.store import RunRow, Store
+
+MAP = "viridis"
+EXPERT, POLICY = "#D55E00", "#0072B2"  # red and blue of Okabe and Ito, as in the paper's figure
+LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, of a reward from 0 to 1
+
+
+@dataclass(frozen=True, eq=False)
+class Landscape:
+    """The reward that a run's policy climbed after one epoch. Positions are in the environment's own (raw) units."""
+
+    epoch: int
+    x: Floats  # (W,)
+    y: Floats  # (H,)
+    unit: float  # raw length of a scaled unit
+    reward: Floats  # (N, H, W) of each agent
+    gradient: Floats  # (N, H, W, 2) per scaled unit
+    rollouts: Floats  # (R, T, N, 2) of the policy of that epoch
+    expert: Floats  # (M, T, N, 2)
+
+    @property
+    def plane(self) -> Plane:
+        """The grid in raw units."""
+        return Plane(self.x, self.y)
+
+    @property
+    def owner(self) -> Integers:
+        """(H, W) the agent whose expert comes nearest to each point of the plane."""
+        tracks = [self.expert[:, :, n].reshape(-1, 2) for n in range(len(self.reward))]
+        points = self.plane.points
+        away = [np.linalg.norm(nearest_points(points, track) - points, axis=-1) for track in tracks]
+        owner: Integers = np.stack(away).argmin(axis=0)
+        return owner
+
+    def joined(self, values: Floats) -> Floats:
+        """(H, W) of (N, H, W): at each point the value of the agent that owns it."""
+        joined: Floats = np.take_along_axis(values, self.owner[None], axis=0)[0]
+        return joined
+
+    def share(self, usable: float) -> float:
+        """The slope share (ssmail.evaluation.landscape) with another threshold than the stored metric has."""
+        scaled = Plane(self.plane.x / self.unit, self.plane.y / self.unit)
+        return slope_share(self.reward, self.gradient, scaled, usable)
+
+
+def stored_epochs(store: Store, run: RunRow) -> list[int]:
+    """The epochs whose landscapes the run stored, rising. Raises InputError, with the remedy, when there is none."""
+    names = [re.fullmatch(r"landscape/(\d+)/reward", name) for name in store.array_names(run.id)]
+    epochs = sorted(int(found[1]) for found in names if found)
+    if not epochs:
+        raise InputError(f"run {run.name} {_lack(run)}")
+    return epochs
+
+
+def _lack(run: RunRow) -> str:
+    """Why a run has no landscape."""
+    if not run.spec.get("adversarial"):
+        return f"({run.method}) learns no reward, so it has no landscape; take one of ssail, gail or wail."
+    if run.environment == "mocap":
+        return "is on mocap, which is no plane; landscapes are of planar environments."
+    remedy = f"`ssmail train --method {run.method} --env {run.environment} --profile {run.profile} --resume never`"
+    return f"stored no landscape: it is older than they are, or was stopped before its first epoch; run {remedy}."
+
+
+def read(store: Store, run: RunRow, epoch: int) -> Landscape:
+    """The landscape of that epoch, one of `stored_epochs`."""
+
+    def array(name: str) -> Floats:
+        values: Floats = store.array(run.id, f"landscape/{name}").astype(np.float64)
+        return values
+
+    return Landscape(
+        epoch,
+        x=array("x"),
+        y=array("y"),
+        unit=float(array("unit")[0]),
+        reward=array(f"{epoch:04d}/reward"),
+        gradient=array(f"{epoch:04d}/gradient"),
+        rollouts=array(f"{epoch:04d}/rollouts"),
+        expert=array("expert"),
+    )
+
+
+def normalised(reward: Floats) -> Floats:
+    """The reward from 0, its lowest value in the array, to 1, its highest; 0.5 where it is the same everywhere."""
+    low, span = reward.min(), np.ptp(reward)
+    return (reward - low) / span if span > 0 else np.full_like(reward, 0.5)
+
+
+def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[float, float] = (0, 1)) -> AxesImage:
+    """(H, W) as colours, with contour lines at tenths of the limits: dense where it is steep."""
+    edges = extent(landscape)
+    image = axes.imshow(
+        reward, origin="lower", extent=edges, cmap=MAP, vmin=limits[0], vmax=limits[1], interpolation="bilinear"
+    )
+    levels = limits[0] + LEVELS * (limits[1] - limits[0])
+    if np.ptp(reward) > 0:
+        axes.contour(landscape.x, landscape.y, reward, levels=levels, colors="white", linewidths=0.3, alpha=0.7)
+    frame(axes, landscape)
+    return image
+
+
+def frame(axes: Axes, landscape: Landscape) -> None:
+    """Limits and equal scales, without a grid."""
+    left, right, bottom, top = extent(landscape)
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.set_aspect("equal")
+    axes.grid(False)
+
+
+def extent(landscape: Landscape) -> tuple[float, float, float, float]:
+    """Left, right, bottom and top edge of the plane's cells."""
+    half = landscape.plane.spacing / 2
+    x, y = landscape.x, landscape.y
+    return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
+
+
+def draw_paths(axes: Axes, trajectories: Floats, colour: str, **line: Any) -> None:
+    """(R, T, N, 2): a line for each agent of each trajectory."""
+    style_of = {"lw": 0.6, "solid_capstyle": "round", **line}
+    for trajectory in trajectories:
+        axes.plot(trajectory[..., 0], trajectory[..., 1], color=colour, **style_of)
+
+
+def path_rows(trajectories: Floats, **columns: object) -> pd.DataFrame:
+    """(R, T, N, 2) as rows of trajectory, agent, step, x, y after the constant `columns`."""
+    trajectory, step, agent = (index.ravel() for index in np.indices(trajectories.shape[:-1]))
+    x, y = trajectories.reshape(-1, 2).T
+    return pd.DataFrame({**columns, "trajectory": trajectory, "agent": agent, "step": step, "x": x, "y": y})
+
+
+def plane_rows(landscape: Landscape, values: Sequence[tuple[str, Floats]], **columns: object) -> pd.DataFrame:
+    """The points of the plane as rows of x, y and each named (H, W) of `values`."""
+    x, y = np.meshgrid(landscape.x, landscape.y)
+    named = {name: array.ravel() for name, array in values}
+    return pd.DataFrame({**columns, "x": x.ravel(), "y": y.ravel(), **named})
+
+
+def height(landscape: Landscape, width: float, ceiling: float = 2.6) -> float:
+    """Inches that a panel of this width needs for equal scales."""
+    left, right, bottom, top = extent(landscape)
+    return float(np.clip(width * (top - bottom) / (right - left), 0.5, ceiling))
