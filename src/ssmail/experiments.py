@@ -1,6 +1,7 @@
 """experiments.yaml -> run specs: defaults <- environments.ENV <- methods.METHOD <- profiles.PROFILE <- overrides.
 
-A profile may itself hold `environments: {ENV: {...}}` and `methods: {METHOD: {...}}`, which apply after its own keys.
+A profile may itself hold `environments: {ENV: {...}}` and `methods: {METHOD: {...}}`, which apply after its own keys;
+an environment may hold `methods: {METHOD: {...}}`, which apply after those of the method.
 The specs of an ablation have its `settings`, and then the profile's `ablations: {NAME: {...}}`, before the overrides.
 """
 
@@ -231,29 +232,47 @@ def _pinned(label: Any, experiments: Experiments) -> Any:
 
 def _file_layers(experiments: Experiments, method: str, environment: str, profile: str) -> list[_Layer]:
     """The layers of experiments.yaml for one cell, weakest first."""
-    file = experiments.path.name
     environment_values = _named(experiments.environments, "environment", environment)
     method_values = _named(experiments.methods, "method", method)
-    profile_values = dict(_named(experiments.profiles, "profile", profile))
-    special: list[_Layer] = []
-    for section, chosen, known in (
-        ("environments", environment, experiments.environments),
-        ("methods", method, experiments.methods),
-        ("ablations", None, experiments.ablations),  # here for the check of its names; see _ablation_layers
-    ):
-        entries = _mapping(profile_values.pop(section, None), f"profiles.{profile}.{section} of {file}")
-        for name in entries:
-            _named(known, f"{section.removesuffix('s')} in profiles.{profile} of {file}", name)
-        if chosen is not None:
-            source = f"profiles.{profile}.{section}.{chosen} of {file}"
-            special.append(_Layer(source, _mapping(entries.get(chosen), source)))
+    profile_values = _named(experiments.profiles, "profile", profile)
+    special = _Special(experiments, method, environment)
+    own, *for_methods = special.layers(f"environments.{environment}", environment_values)
     return [
-        _Layer(f"defaults of {file}", experiments.defaults),
-        _Layer(f"environments.{environment} of {file}", environment_values),
-        _Layer(f"methods.{method} of {file}", method_values),
-        _Layer(f"profiles.{profile} of {file}", profile_values),
-        *special,
+        _Layer(f"defaults of {experiments.path.name}", experiments.defaults),
+        own,
+        _Layer(f"methods.{method} of {experiments.path.name}", method_values),
+        *for_methods,
+        *special.layers(f"profiles.{profile}", profile_values),
     ]
+
+
+class _Special(NamedTuple):
+    """Takes apart what an environment or a profile holds: its own keys, and those for a method or an environment."""
+
+    experiments: Experiments
+    method: str
+    environment: str
+
+    def layers(self, name: str, values: Mapping[str, Any]) -> list[_Layer]:
+        """The values' own layer, those of the sections within it that apply, and what these hold; weakest first."""
+        file, own = self.experiments.path.name, dict(values)
+        sections: list[_Layer] = []
+        within: list[_Layer] = []
+        for section, chosen, known in (
+            ("environments", self.environment, self.experiments.environments),
+            ("methods", self.method, self.experiments.methods),
+            ("ablations", None, self.experiments.ablations),  # here for the check of its names; see _ablation_layers
+        ):
+            entries = _mapping(own.pop(section, None), f"{name}.{section} of {file}")
+            for entry in entries:
+                _named(known, f"{section.removesuffix('s')} in {name} of {file}", entry)
+            if chosen is not None:
+                source = f"{name}.{section}.{chosen}"
+                held = _mapping(entries.get(chosen), f"{source} of {file}")
+                layer, *deeper = self.layers(source, held) if held else [_Layer(source, held)]
+                sections.append(layer)
+                within += deeper
+        return [_Layer(f"{name} of {file}", own), *sections, *within]
 
 
 def _ablation(experiments: Experiments, name: str, environment: str | None = None) -> Ablation:

@@ -122,11 +122,13 @@ class ModelSpec(Frozen):
     start_input: bool  # every network reads each agent's first state
     root_relative: bool  # positions are read relative to the first agent's, whose own are left out
     agent_input: bool  # every network reads which agent it looks at, one-hot (agents that are not alike, as joints)
-    action_step: Positive  # an action moves a velocity by at most this much, scaled units
-    action_bound: Positive  # and never beyond this absolute value
-    initial_scale: (
-        NonNegative  # of the actor's last weights: how far the untrained policy's mean strays from the velocity
-    )
+    # states and actions are read, and the two keys that follow are given, in units of each agent's own spread over the
+    # training set, about its mean
+    standardize: bool
+    action_step: Positive  # an action moves a velocity by at most this much; scaled units if not standardize
+    action_bound: Positive  # and never farther from 0 (with standardize: from the mean) than this
+    # of the actor's last weights: how far the mean of the untrained policy strays from the current velocity
+    initial_scale: NonNegative
     log_std_min: Finite
     log_std_max: Finite
 
@@ -190,12 +192,17 @@ class SacSpec(Frozen):
     automatic_temperature: bool
     temperature_learning_rate: Positive
     target_entropy: Finite  # nats for each action dimension of one agent, in scaled velocity units
+    # consecutive steps of a trajectory through which the encoder's gradient goes in an update; null: all
+    encoder_steps: Count | None
     graph_entropy: NonNegative  # weight of the edge-type distribution's entropy in the actor's objective
 
 
 class VariationalSpec(Frozen):
     """Sizes and terms of nri and dnri (Kipf et al. 2018; Graber and Schwing 2020)."""
 
+    root_relative: bool  # as in the section model
+    agent_input: bool
+    standardize: bool
     hidden: Count  # of the encoder's perceptrons
     memory: Count  # of the LSTM of each edge, in each direction (dnri)
     head: Count  # hidden size of the heads that give the edge types

@@ -26,6 +26,7 @@ SPEC = ModelSpec(
     graph_resample="trajectory",
     time_input=False,
     start_input=False,
+    standardize=False,
     action_step=0.3,
     action_bound=1.5,
     initial_scale=0.1,

@@ -9,6 +9,9 @@ from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from ssmail.spec import VariationalSpec
 
 SPEC = VariationalSpec(
+    root_relative=False,
+    agent_input=False,
+    standardize=False,
     hidden=8,
     memory=5,
     head=6,

@@ -155,3 +155,23 @@ def test_the_actor_waits_for_its_start_while_its_judges_learn() -> None:
             )
             assert (policy, critic, discriminator) == (moves, True, True)
             assert torch.equal(temperature, made.actor_critic.temperature) is not moves
+
+
+def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
+    """The same graphs and entropy; with as many steps as there are, or null, no gradient is missing."""
+    made, loop = learner("model.graph_noise=edge")
+    x = made.features(loop.experts.states[:4], loop.experts.states[:4, 0])
+    policy, results = made.actor_critic.policy, []
+    for steps in (None, 5, 10**6):
+        made.actor_critic.spec = made.actor_critic.spec.model_copy(update={"encoder_steps": steps})
+        made.generators.load_state_dict(loop.generators.state_dict())
+        made.generators["policy"].manual_seed(1)
+        graph, entropy = made.actor_critic._graphs(x)
+        policy.zero_grad()
+        (graph * torch.arange(2.0)).sum().backward(retain_graph=True)
+        results.append((graph.detach(), entropy.detach(), policy.encoder.head.weight.grad.clone()))
+    whole, part, more = results
+    torch.testing.assert_close(whole[0], part[0])
+    torch.testing.assert_close(whole[1], part[1])
+    assert 0 < float(part[2].norm()) < float(whole[2].norm())
+    torch.testing.assert_close(more[2], whole[2])

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.message_passing import TypedMessages, perceptron
+from ssmail.models.standards import Reach
 from ssmail.spec import ModelSpec
 
 EDGE = 0.999  # of the action's range: where log_prob takes actions at the edge to be (atanh is exact to 1e-4 there)
@@ -18,9 +19,16 @@ class Actor(nn.Module):
     action_bound.
     """
 
-    def __init__(self, inputs: int, action_size: int, spec: ModelSpec) -> None:
+    step: Tensor  # d
+    low: Tensor  # of c
+    high: Tensor
+
+    def __init__(self, inputs: int, action_size: int, spec: ModelSpec, reach: Reach | None = None) -> None:
         super().__init__()
-        self.step, self.bound = spec.action_step, spec.action_bound
+        reach = reach or Reach.of(spec)
+        self.register_buffer("step", reach.step, persistent=False)
+        self.register_buffer("low", reach.low + reach.step, persistent=False)
+        self.register_buffer("high", reach.high - reach.step, persistent=False)
         self.log_std_range = (spec.log_std_min, spec.log_std_max)
         self.messages = TypedMessages(inputs, spec)
         self.own_input = spec.own_input
@@ -71,11 +79,10 @@ class Actor(nn.Module):
         return self._centre(velocity) + self.step * torch.tanh(u)
 
     def _centre(self, velocity: Tensor) -> Tensor:
-        inner = self.bound - self.step
-        return velocity.clamp(-inner, inner)
+        return torch.maximum(torch.minimum(velocity, self.high), self.low)
 
     def _log_density(self, u: Tensor, noise: Tensor, log_std: Tensor) -> Tensor:
         """log p(a) of the action of u = mean + std * noise, summed over the axes."""
         gaussian = -0.5 * noise**2 - log_std - 0.5 * math.log(2 * math.pi)
-        jacobian = math.log(self.step) + 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
+        jacobian = self.step.log() + 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
         return (gaussian - jacobian).sum(dim=-1)

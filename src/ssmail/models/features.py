@@ -2,12 +2,13 @@
 agent it is.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
-from ssmail.spec import ModelSpec
+from ssmail.models.standards import Standards
+from ssmail.spec import ModelSpec, VariationalSpec
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,7 @@ class Features:
     steps: the trajectory length that the step index is scaled with: 0 .. steps - 1 -> -1 .. 1.
     root_relative: positions are differences to those of agent 0, the root of a skeleton; its own are then zeros.
     agents: N of the one-hot of the agent; 0 leaves it out.
+    standards: the units that an agent's state and action are read in; None leaves them in scaled units.
     """
 
     time: bool
@@ -24,11 +26,16 @@ class Features:
     steps: int
     root_relative: bool = False
     agents: int = 0
+    standards: Standards | None = None
 
     @classmethod
-    def of(cls, spec: ModelSpec, steps: int, agents: int) -> "Features":
-        """Those of a spec, for trajectories of `steps` states of `agents` agents."""
-        return cls(spec.time_input, spec.start_input, steps, spec.root_relative, agents * spec.agent_input)
+    def of(cls, spec: ModelSpec | VariationalSpec, experts: Tensor) -> "Features":
+        """Those of a spec, for trajectories like the training set's: experts (M, T, N, D), scaled."""
+        steps, agents = experts.shape[1:3]
+        plain = cls(False, False, steps, spec.root_relative, agents * spec.agent_input)
+        if isinstance(spec, ModelSpec):
+            plain = replace(plain, time=spec.time_input, start=spec.start_input)
+        return replace(plain, standards=Standards.of(plain._relative(experts))) if spec.standardize else plain
 
     def size(self, state_size: int) -> int:
         """Number of features of an agent with D state features."""
@@ -37,16 +44,29 @@ class Features:
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
         """states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) -> (B, T, N, F)."""
         b, t, n, _ = states.shape
-        parts = [self._relative(states)]
+        parts = [self._read(states)]
         if self.time:
             steps = torch.arange(first_step, first_step + t, dtype=states.dtype, device=states.device)
             scaled = 2 * steps / (self.steps - 1) - 1
             parts.append(scaled.view(1, t, 1, 1).expand(b, t, n, 1))
         if self.start:
-            parts.append(self._relative(start).unsqueeze(1).expand(b, t, n, -1))
+            parts.append(self._read(start).unsqueeze(1).expand(b, t, n, -1))
         if self.agents:
             parts.append(torch.eye(n, dtype=states.dtype, device=states.device).expand(b, t, n, n))
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+
+    def of_actions(self, actions: Tensor) -> Tensor:
+        """Actions (..., N, A), which are velocities, in the units that they are read in."""
+        return actions if self.standards is None else self.standards.velocity.standardize(actions)
+
+    def to_actions(self, read: Tensor) -> Tensor:
+        """Actions (..., N, A) in scaled units from what a network says in those that it reads."""
+        return read if self.standards is None else self.standards.velocity.restore(read)
+
+    def _read(self, states: Tensor) -> Tensor:
+        """States (..., N, 2P) in the units that they are read in."""
+        relative = self._relative(states)
+        return relative if self.standards is None else self.standards.standardize(relative)
 
     def _relative(self, states: Tensor) -> Tensor:
         """States (..., N, 2P) with the positions that are read."""

@@ -19,7 +19,7 @@ from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
 from ssmail.training.updates import clipped_step
 
-Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions (B, T, N, A) -> rewards (B, T, N)
+Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions as read (B, T, N, A) -> rewards (B, T, N)
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Transitions:
     """Some time steps of some trajectories: what actor and critics learn from. C steps are chosen of each."""
 
     x: Tensor  # (B, C, N, F)
-    actions: Tensor  # (B, C, N, A)
+    actions: Tensor  # (B, C, N, A), as they are read
     graph: Tensor  # (B, C, N, N, K), with gradient
     velocity: Tensor  # (B, C, N, A) before the action
     next_x: Tensor
@@ -86,6 +86,7 @@ class ActorCritic:
             next_action, next_log_prob = self.policy.actor.sample_with_log_prob(
                 at.next_x, at.next_graph, at.next_velocity, self._noise(at.actions)
             )
+            next_action = self.features.of_actions(next_action)
             next_q = self.target_critic(at.next_x, next_action, at.next_graph)
             target = critic_target(rewards, next_q, next_log_prob, self.temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
@@ -110,22 +111,43 @@ class ActorCritic:
         # The graph after step t is inferred from the states that the policy read, so one pass of the encoder serves
         # both ends of a transition.
         history = torch.cat([x, next_x[:, -1:]], dim=1)
-        noise = self.policy.draw_graph_noise(len(batch), history.shape[1], states.shape[2], self.generators["policy"])
-        graphs, logits, _ = self.policy.graphs(history, noise.to(self.device))
+        graphs, edge_entropy = self._graphs(history)
         at = chosen(x.shape[1])
         return Transitions(
             x=x[:, at],
-            actions=batch.actions[:, at],
+            actions=self.features.of_actions(batch.actions[:, at]),
             graph=graphs[:, at],
             velocity=states[:, at, :, a:],
             next_x=next_x[:, at],
             next_graph=graphs[:, at + 1].detach(),
             next_velocity=next_states[:, at, :, a:],
-            edge_entropy=graph_entropy(logits),
+            edge_entropy=edge_entropy,
         )
+
+    def _graphs(self, history: Tensor) -> tuple[Tensor, Tensor]:
+        """Sampled graphs (B, T, N, N, K) of features (B, T, N, F), and the entropy of their distribution.
+
+        With sac.encoder_steps the gradient goes through that many consecutive steps alone, from a random one on:
+        backpropagation through time, truncated. The values are the same.
+        """
+        b, t, n, _ = history.shape
+        noise = (
+            self.policy.draw_graph_noise(b, t, n, self.generators["policy"]).to(self.device).expand(b, t, -1, -1, -1)
+        )
+        learned = min(self.spec.encoder_steps or t, t)
+        start = int(torch.randint(t - learned + 1, (), generator=self.generators["data"])) if learned < t else 0
+        graphs, logits, memory = [], [], None
+        for first, last in ((0, start), (start, start + learned), (start + learned, t)):
+            if first < last:
+                with torch.set_grad_enabled(first == start):
+                    graph, logit, memory = self.policy.graphs(history[:, first:last], noise[:, first:last], memory)
+                graphs.append(graph)
+                logits.append(logit)
+        return torch.cat(graphs, dim=1), graph_entropy(torch.cat(logits, dim=1))
 
     def _update_actor(self, at: Transitions, learns: bool) -> tuple[Tensor, Tensor]:
         action, log_prob = self.policy.actor.sample_with_log_prob(at.x, at.graph, at.velocity, self._noise(at.actions))
+        action = self.features.of_actions(action)
         self.critic.requires_grad_(False)
         loss = actor_loss(self.critic(at.x, action, at.graph.detach()), log_prob, self.temperature)
         self.critic.requires_grad_(True)

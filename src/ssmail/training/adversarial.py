@@ -17,6 +17,7 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
+from ssmail.models.standards import Reach
 from ssmail.rewards import gail_reward, ssail_reward, wail_reward
 from ssmail.spec import Pairing, SelfSupervisionSpec, used
 from ssmail.training.actor_critic import ActorCritic
@@ -59,11 +60,11 @@ class AdversarialLearner:
         self.label = checked_label(self.supervision) if self.supervision else None
         self.experts, self.generators, self.device = setting.experts, setting.generators, setting.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
-        self.features = Features.of(model, setting.steps + 1, setting.experts.states.shape[2])
+        self.features = Features.of(model, self.experts.states)
         inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(inputs, action_size, model).to(self.device)
+            policy = GraphPolicy(inputs, action_size, model, Reach.of(model, self.features.standards)).to(self.device)
             critic = TwinCritic(inputs + action_size, model).to(self.device)
             self.discriminator = Discriminator(inputs + action_size, model.hidden).to(self.device)
         self.actor_critic = ActorCritic(
@@ -137,9 +138,9 @@ class AdversarialLearner:
             labels = (self.label(alpha),)
         everything = Batch.concatenate(batches)
         chosen = self._pick_steps(everything.actions.shape[1])
-        x = self.features(everything.states[:, :-1], everything.states[:, 0])[:, chosen]
-        x = self._blurred(x, self.experts.states.shape[-1])
-        actions = self._blurred(everything.actions[:, chosen])
+        states, actions = everything.states[:, :-1], everything.actions[:, chosen]
+        x = self._blurred(self.features(states, states[:, 0])[:, chosen], states.shape[-1])
+        actions = self._blurred(self.features.of_actions(actions))
         loss, terms = self.game.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
         if self.wasserstein and self.wasserstein.constraint == "penalty":
             terms["penalty"] = self.wasserstein.penalty * self._penalty(x, actions)

@@ -7,6 +7,7 @@ from torch import nn
 
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
+from ssmail.models.standards import Reach
 from ssmail.spec import used
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
@@ -23,10 +24,11 @@ class CloningLearner:
         self.setting, self.cloning, self.training = setting, used(spec.cloning), used(spec.training)
         self.generators, self.device = setting.generators, setting.device
         state_size, action_size = setting.experts.states.shape[-1], setting.experts.actions.shape[-1]
-        features = Features.of(model, setting.steps + 1, setting.experts.states.shape[2])
+        features = Features.of(model, setting.experts.states)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            self.policy = GraphPolicy(features.size(state_size), action_size, model).to(self.device)
+            policy = GraphPolicy(features.size(state_size), action_size, model, Reach.of(model, features.standards))
+        self.policy = policy.to(self.device)
         self.predictor = PolicyPredictor(self.policy, features, setting.integrator)
         self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=self.cloning.learning_rate, fused=True)
         self.rates = DecayingRates(

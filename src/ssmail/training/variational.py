@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
+from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from ssmail.spec import VariationalSpec, used
@@ -28,9 +29,10 @@ class VariationalModel(nn.Module):
 
     fixed_prior: Tensor
 
-    def __init__(self, inputs: int, action_size: int, spec: VariationalSpec, dynamic: bool) -> None:
+    def __init__(self, features: Features, state_size: int, spec: VariationalSpec, dynamic: bool) -> None:
         super().__init__()
-        self.spec, self.dynamic = spec, dynamic
+        self.features, self.spec, self.dynamic = features, spec, dynamic
+        inputs, action_size = features.size(state_size), state_size // 2
         self.encoder = DynamicEncoder(inputs, spec) if dynamic else StaticEncoder(inputs, spec)
         self.decoder = make_decoder(inputs, action_size, spec)
         self.register_buffer("fixed_prior", fixed_prior(spec.edge_types, spec.none_prior), persistent=False)
@@ -38,18 +40,32 @@ class VariationalModel(nn.Module):
 
     def posterior(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """states (B, T, N, D) -> logits of the posterior, (B, T or 1, N, N, K), and of the prior."""
+        x = self.read(states)
         if isinstance(self.encoder, DynamicEncoder):
-            prior, posterior = self.encoder(states)
+            prior, posterior = self.encoder(x)
             return posterior, prior
-        return self.encoder(states), self.fixed_prior
+        return self.encoder(x), self.fixed_prior
 
     def past_logits(self, states: Tensor) -> Tensor:
         """(B, T, N, N, K): what is known of the graph at each step from the steps so far: dnri's prior, and nri's
         posterior given those steps.
         """
+        x = self.read(states)
         if isinstance(self.encoder, DynamicEncoder):
-            return self.encoder.prior(states)[0]
-        return self.encoder.running(states)
+            return self.encoder.prior(x)[0]
+        return self.encoder.running(x)
+
+    def read(self, states: Tensor) -> Tensor:
+        """What encoder and decoder read of states (B, T, N, D): (B, T, N, F)."""
+        return self.features(states, states[:, 0])
+
+    def decode(self, states: Tensor, graphs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Actions (B, T, N, A) after states (B, T, N, D) under graphs (B, T or 1, N, N, K), and the decoder's memory.
+
+        The decoder's residual is one on the velocity as it is read.
+        """
+        said, memory = self.decoder(self.read(states), graphs, memory)
+        return self.features.to_actions(said), memory
 
     def sample(self, logits: Tensor, noise: Tensor) -> Tensor:
         """One-hot graphs, straight-through."""
@@ -84,7 +100,7 @@ class _Graphs:
         if self.fixed is not None:
             return self.fixed
         assert isinstance(self.model.encoder, DynamicEncoder)
-        logits, self.memory = self.model.encoder.prior(states, self.memory)
+        logits, self.memory = self.model.encoder.prior(self.model.read(states), self.memory)
         first, self.step = self.step, self.step + states.shape[1]
         return self.model.sample(logits, self.gumbel[:, first : self.step])
 
@@ -117,12 +133,12 @@ class VariationalPredictor:
             memory: Tensor | None = None
             if h > 1:
                 past = observed[:, :-1] + noise[:, : h - 1]
-                _, memory = self.model.decoder(past, graphs.of(past))
+                _, memory = self.model.decode(past, graphs.of(past))
             state = observed[:, -1:]
             states = [state]
             for t in range(h - 1, h - 1 + steps):
                 read = state + noise[:, t : t + 1]
-                action, memory = self.model.decoder(read, graphs.of(read), memory)
+                action, memory = self.model.decode(read, graphs.of(read), memory)
                 state = self.integrator.step(state, action)
                 states.append(state)
         return torch.cat(states, dim=1)
@@ -134,7 +150,7 @@ class VariationalPredictor:
         noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
         with evaluation_mode(self.model):
             graphs = self.model.sample(self.model.past_logits(now), noise)
-            action, _ = self.model.decoder(now, graphs)
+            action, _ = self.model.decode(now, graphs)
         return self.integrator.step(now, action)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "VariationalPredictor":
@@ -161,10 +177,11 @@ class VariationalLearner:
         self.setting, self.variational, self.cloning = setting, used(spec.variational), used(spec.cloning)
         self.curriculum, self.training = used(spec.curriculum), used(spec.training)
         self.generators, self.device = setting.generators, setting.device
-        state_size, action_size = setting.experts.states.shape[-1], setting.experts.actions.shape[-1]
+        features = Features.of(self.variational, setting.experts.states)
+        state_size = setting.experts.states.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            model = VariationalModel(state_size, action_size, self.variational, dynamic=spec.method == "dnri")
+            model = VariationalModel(features, state_size, self.variational, dynamic=spec.method == "dnri")
         self.model = model.to(self.device)
         self.predictor = VariationalPredictor(self.model, setting.integrator)
         self.optimizer = torch.optim.Adam(self.model.parameters(), lr=self.cloning.learning_rate, fused=True)
@@ -207,9 +224,9 @@ class VariationalLearner:
 
     def _decode(self, states: Tensor, graphs: Tensor, interventions: Tensor) -> Tensor:
         """Predicted next states (B, T, N, D); all steps at once where every input is the expert's."""
-        integrator, decoder = self.setting.integrator, self.model.decoder
+        integrator, decode = self.setting.integrator, self.model.decode
         if bool(interventions[:, 1:].all()):
-            return integrator.step(states, decoder(states, graphs)[0])
+            return integrator.step(states, decode(states, graphs)[0])
         b, steps = interventions.shape
         graphs = graphs.expand(-1, steps, -1, -1, -1)
         predicted: list[Tensor] = []
@@ -218,7 +235,7 @@ class VariationalLearner:
             given = states[:, t : t + 1]
             if t:
                 given = torch.where(interventions[:, t].view(b, 1, 1, 1), given, predicted[-1])
-            action, memory = decoder(given, graphs[:, t : t + 1], memory)
+            action, memory = decode(given, graphs[:, t : t + 1], memory)
             predicted.append(integrator.step(given, action))
         return torch.cat(predicted, dim=1)
 
