@@ -46,6 +46,13 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "runs compare",
         "runs export",
         "runs delete",
+        "db",
+        "db info",
+        "db upgrade",
+        "db check",
+        "db backup",
+        "db merge",
+        "db export",
     }
 
 
