@@ -8,7 +8,7 @@ import typer
 
 from ssmail.errors import InputError
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_json
+from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, write_json
 
 if TYPE_CHECKING:
     from ssmail.figures.needs import Needs
@@ -197,7 +197,7 @@ def _fates(done: "Merge") -> str:
 
 def _difference(found: "Difference") -> str:
     where = f" at epoch {found.step}" if found.step is not None else ""
-    kept, left_out = (short(value, 17) for value in (found.kept_value, found.left_out_value))
+    kept, left_out = ("absent" if value is None else value for value in (found.kept_value, found.left_out_value))
     return (
         f"nondeterminism: {found.method} on {found.environment}, spec {found.spec_hash[:8]}, seed {found.seed}: "
         f"{found.metric}{where} is {kept} in run {found.kept[:8]}, which is kept, and {left_out} in run "

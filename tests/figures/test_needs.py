@@ -28,8 +28,9 @@ def filled(store: Store, add_run: Any, ablate: Any, add_forecast: Any, vary_alph
     for seed in (0, 1):
         rollouts = rng.normal(size=(3, STARTS, 5, 2, 2)).astype(np.float32)
         lanes = rng.normal(size=(2, STARTS, 5, 2, 2)).astype(np.float32)
-        add_run(seed, test__rollouts=rollouts, test__lanes=lanes)
-    add_run(2, [0.5], RunState.DIVERGED)
+        losses = {"discriminator/generated": [0.3, 0.2, 0.1], "discriminator/expert": [0.2, 0.2, 0.1]}
+        add_run(seed, epochs=losses, test__rollouts=rollouts, test__lanes=lanes)
+    add_run(2, [0.5], RunState.DIVERGED, epochs={name: [0.3] for name in losses})
     add_run(3, state=RunState.INTERRUPTED)
     add_run(0, method="dnri", overrides=["cloning.learning_rate=0.5"])
     return store

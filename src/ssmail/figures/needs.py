@@ -40,10 +40,11 @@ class RecordingStore(Store):
 
     def array(self, run_id: str, name: str) -> npt.NDArray[Any]:
         """As Store.array; an array that is needed whole once is remembered as such."""
+        array = super().array(run_id, name)  # first: what is not there cannot be kept
         thin = self.thinnings.get(name)
         known = self.arrays.setdefault(run_id, {})
         known[name] = thin if known.get(name, thin) is thin else None
-        return super().array(run_id, name)
+        return array
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, Table, func, insert, select
 
 from ssmail.store import arrays, schema
 from ssmail.store.connection import connect, reading, writing
@@ -102,7 +102,7 @@ def _carry(there: Connection, here: Connection, run: RunRow, wanted: Wanted) -> 
 
 
 def _metrics(
-    connection: Connection, run_id: str, table: schema.Table, curves: Collection[str]
+    connection: Connection, run_id: str, table: Table, curves: Collection[str]
 ) -> Iterator[list[dict[str, Any]]]:
     """Rows of the table, some at a time: of `metric` those of the curves, and of the others the last one."""
     query = select(table).where(table.c.run_id == run_id)
@@ -117,7 +117,7 @@ def _metrics(
 def _counts(there: Connection, here: Connection, runs: Sequence[RunRow]) -> dict[str, int]:
     ids = [run.id for run in runs]
 
-    def count(connection: Connection, table: schema.Table) -> int:
+    def count(connection: Connection, table: Table) -> int:
         query = select(func.count()).select_from(table).where(table.c.run_id.in_(ids))
         return int(connection.execute(query).scalar_one())
 

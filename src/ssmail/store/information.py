@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, Table, func, select
 
 from ssmail.store import schema
 from ssmail.store.connection import reading
@@ -64,7 +64,7 @@ def inform(where: str | Path) -> DatabaseInformation:
 
 
 def _rows(connection: Connection) -> dict[str, int]:
-    def count(table: schema.Table) -> int:
+    def count(table: Table) -> int:
         return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
 
     sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, insert, select
+from sqlalchemy import Connection, Table, func, insert, select
 
 from ssmail.store import schema
 from ssmail.store.queries import RunRow
@@ -53,11 +53,11 @@ def first_difference(here: Connection, kept: RunRow, there: Connection, other: R
     value of the same metric and step it is the same; how long epochs took is not compared.
     """
     ours, theirs = (_values(*pair, schema.metric) for pair in ((here, kept.id), (there, other.id)))
-    common = ours.keys() & theirs.keys()  # a compact copy has fewer
-    parted = {key for key in common if ours[key] != theirs[key]}
     our_last, their_last = (_values(*pair, schema.metric_latest) for pair in ((here, kept.id), (there, other.id)))
-    parted |= {key for key, _ in our_last.items() ^ their_last.items()}
+    common = ours.keys() & theirs.keys()  # a compact copy has fewer
+    last = {key for key, _ in our_last.items() ^ their_last.items()}
     ours, theirs = ours | our_last, theirs | their_last
+    parted = {key for key in common | last if ours.get(key) != theirs.get(key)}
     names = (kept.method, kept.environment, kept.seed, kept.spec_hash, kept.id, other.id)
     if parted:
         step, name = min(parted)
@@ -73,14 +73,14 @@ def carry(there: Connection, here: Connection, run_id: str) -> None:
         here.execute(insert(table), rows)
 
 
-def _rows(connection: Connection, run_id: str) -> Iterator[tuple[list[dict[str, Any]], schema.Table]]:
+def _rows(connection: Connection, run_id: str) -> Iterator[tuple[list[dict[str, Any]], Table]]:
     for table in (schema.run, *CHILDREN):
         key = table.c.id if table is schema.run else table.c.run_id
         for part in connection.execute(select(table).where(key == run_id)).mappings().partitions(_ROWS):
             yield [dict(row) for row in part], table
 
 
-def _values(connection: Connection, run_id: str, table: schema.Table) -> Values:
+def _values(connection: Connection, run_id: str, table: Table) -> Values:
     query = select(table.c.step, table.c.name, table.c.kind, table.c.value).where(table.c.run_id == run_id)
     rows = connection.execute(query.where(table.c.name.not_in(NOT_COMPARED)))
     return {(step, name): (kind, value) for step, name, kind, value in rows}
