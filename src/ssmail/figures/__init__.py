@@ -43,7 +43,7 @@ class FigureRecord(Protocol):
         ...
 
     def table(self) -> "pd.DataFrame":
-        """Exactly what is shown, one row for each point."""
+        """Exactly what is shown, one row for each point. The column before `run_id` says what its curve is called."""
         ...
 
 
