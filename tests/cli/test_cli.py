@@ -40,12 +40,20 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "ablate-beta",
         "reproduce",
         "plot",
+        "explain",
         "runs",
         "runs list",
         "runs show",
         "runs compare",
         "runs export",
         "runs delete",
+        "db",
+        "db info",
+        "db upgrade",
+        "db check",
+        "db backup",
+        "db merge",
+        "db export",
     }
 
 

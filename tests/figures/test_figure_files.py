@@ -15,7 +15,7 @@ from PIL import Image
 
 import ssmail
 from ssmail.errors import InputError
-from ssmail.figures import FIGURES, provenance, save
+from ssmail.figures import FIGURES, provenance, save, saving
 from ssmail.store import RunState, Store
 
 NAMES = ("fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "fig9")
@@ -46,7 +46,8 @@ def saved(store: Store, name: str, outdir: Path, formats: Sequence[str] = proven
 
 @pytest.mark.parametrize("name", NAMES)
 def test_each_format_gives_its_provenance_back(whole: Store, tmp_path: Path, name: str) -> None:
-    expected = FIGURES[name].collect(whole).provenance
+    record = FIGURES[name].collect(whole)
+    expected = saving.embedded(record, saving.csv_text(record.table()))
     *images, csv = saved(whole, name, tmp_path, FORMATS[name])
     stem = FIGURES[name].stem
     assert [path.name for path in images] == [f"{stem}.{format}" for format in FORMATS[name]]
@@ -70,7 +71,8 @@ def test_provenance_names_runs_specs_data_and_code(filled: Store) -> None:
 
 def test_other_readers_find_it_and_no_date(filled: Store, tmp_path: Path) -> None:
     png, pdf, svg, _ = saved(filled, "fig4", tmp_path)
-    text = FIGURES["fig4"].collect(filled).provenance.as_json()
+    record = FIGURES["fig4"].collect(filled)
+    text = saving.embedded(record, saving.csv_text(record.table())).as_json()
     with Image.open(png) as image:
         assert image.info["ssmail"] == text
         assert image.size[0] == pytest.approx(3.4 * 300)

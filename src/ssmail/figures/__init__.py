@@ -6,7 +6,7 @@ Figure. Importing this package imports neither matplotlib nor pandas; a figure's
 """
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
     from ssmail.figures.provenance import Provenance
     from ssmail.store import Store
+    from ssmail.store.compact import Thinning
 
 __all__ = ["FIGURES", "FigureModule", "FigureRecord", "NoRuns", "save"]
 
@@ -42,7 +43,7 @@ class FigureRecord(Protocol):
         ...
 
     def table(self) -> "pd.DataFrame":
-        """Exactly what is shown, one row for each point."""
+        """Exactly what is shown, one row for each point. The column before `run_id` says what its curve is called."""
         ...
 
 
@@ -85,6 +86,13 @@ class FigureModule:
     def draw(self, record: FigureRecord) -> "Figure":
         """The record as a matplotlib Figure, one column wide."""
         return cast("Figure", self._module().draw(record))
+
+    def thinnings(self) -> "Mapping[str, Thinning]":
+        """By the names of stored arrays, what makes of each the part that the figure shows, where it does not show all.
+
+        The figure shows the same of the part as of the whole.
+        """
+        return cast("Mapping[str, Thinning]", getattr(self._module(), "THINNINGS", {}))
 
     def _module(self) -> Any:
         return importlib.import_module(f"{__name__}.{self.stem}")

@@ -107,8 +107,21 @@ def _shown(starts: int) -> npt.NDArray[np.int64]:
 
 
 def _expert(store: Store, run: RunRow) -> Floats:
-    lanes = store.array(run.id, "test/lanes")  # (L, B, T, N, 2)
+    return _shown_lanes(store.array(run.id, "test/lanes"))
+
+
+def _shown_lanes(lanes: Floats) -> Floats:
+    """(L, B, T, N, 2) -> (L, R, T, N, 2)."""
     return lanes[:, _shown(lanes.shape[1])]
+
+
+def _shown_rollouts(samples: Floats) -> Floats:
+    """(S, B, T, N, 2) -> (1, R, T, N, 2): the samples in turn."""
+    starts = _shown(samples.shape[1])
+    return samples[np.arange(len(starts)) % len(samples), starts][None]
+
+
+THINNINGS = {"test/lanes": _shown_lanes, "test/rollouts": _shown_rollouts}
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
@@ -134,9 +147,7 @@ def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
 def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
         return Panel(label, run.id, run.seed, None, np.nan, np.nan)
-    samples = store.array(run.id, "test/rollouts")  # (S, B, T, N, 2)
-    starts = _shown(samples.shape[1])
-    rollouts = samples[np.arange(len(starts)) % len(samples), starts]
+    rollouts = _shown_rollouts(store.array(run.id, "test/rollouts"))[0]
     return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
 
 

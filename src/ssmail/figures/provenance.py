@@ -8,8 +8,8 @@ No date is written, so that equal runs give equal files.
 import json
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,10 +18,27 @@ from PIL import Image, UnidentifiedImageError
 from ssmail import __version__
 from ssmail.errors import InputError
 from ssmail.store import RunRow
+from ssmail.store.comparison import spec_differences
 
 FORMATS = ("png", "pdf", "svg")
 
 _SVG_DESCRIPTION = "{http://purl.org/dc/elements/1.1/}description"
+
+
+@dataclass(frozen=True)
+class RunSource:
+    """One run behind a figure, as it was when the figure was drawn."""
+
+    id: str
+    curve: str  # what the figure calls the group that the run is drawn in
+    method: str
+    environment: str
+    profile: str
+    seed: int
+    state: str
+    spec_hash: str
+    dataset_hash: str | None
+    code: str
 
 
 @dataclass(frozen=True)
@@ -34,6 +51,10 @@ class Provenance:
     dataset_hashes: tuple[str, ...]
     code: tuple[str, ...]  # of the runs: package version, "+", git commit, "-dirty" if the tree was changed
     drawn_with: str  # ssmail's version
+    runs: tuple[RunSource, ...] = ()  # in the same order
+    differs: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by spec hash: see spec_differences
+    options: Mapping[str, Any] = field(default_factory=dict)  # with which the figure was collected, beside the runs
+    csv_sha256: str | None = None  # of the CSV that was written with the figure
 
     @classmethod
     def of(cls, figure: str, runs: Sequence[RunRow]) -> Self:
@@ -45,6 +66,8 @@ class Provenance:
             dataset_hashes=_distinct(run.dataset_hash for run in runs if run.dataset_hash),
             code=_distinct(_code(run) for run in runs),
             drawn_with=__version__,
+            runs=tuple(_source(run) for run in runs),
+            differs=spec_differences(runs),
         )
 
     @classmethod
@@ -61,7 +84,8 @@ class Provenance:
         """The inverse of `as_json`. Raises ValueError or TypeError on other text."""
         values: dict[str, Any] = json.loads(text)
         lists = {key: tuple(value) for key, value in values.items() if isinstance(value, list)}
-        return cls(**{**values, **lists})
+        sources = tuple(RunSource(**source) for source in values.get("runs", ()))
+        return cls(**{**values, **lists, "runs": sources})
 
     def metadata(self, format: str) -> dict[str, Any]:
         """What to pass as `metadata` to `Figure.savefig` for one of FORMATS."""
@@ -96,6 +120,21 @@ def read(path: Path) -> Provenance:
 
 def _distinct(values: Any) -> tuple[str, ...]:
     return tuple(sorted(set(values)))
+
+
+def _source(run: RunRow) -> RunSource:
+    return RunSource(
+        id=run.id,
+        curve=run.method,
+        method=run.method,
+        environment=run.environment,
+        profile=run.profile,
+        seed=run.seed,
+        state=run.state.value,
+        spec_hash=run.spec_hash,
+        dataset_hash=run.dataset_hash,
+        code=_code(run),
+    )
 
 
 def _code(run: RunRow) -> str:

@@ -54,9 +54,16 @@ class TrainingRecord:
     """Everything that the figure shows, in the metrics' own units."""
 
     panels: tuple[Panel, ...]
+    group_by: str
     statistic: Statistic
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """With which it was collected."""
+        metrics = [panel.metric for panel in self.panels]
+        return {"metrics": metrics, "group_by": self.group_by, "statistic": str(self.statistic)}
 
     @property
     def stem(self) -> str:
@@ -103,6 +110,7 @@ def collect(
             notes += curve_notes.cut(panels[-1].bands)
     return TrainingRecord(
         panels=tuple(panels),
+        group_by=group_by,
         statistic=statistic,
         provenance=Provenance.of(NAME, list(drawn.values())),
         notes=tuple(notes),

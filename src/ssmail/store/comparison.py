@@ -63,18 +63,21 @@ def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> lis
     specs: dict[str, list[RunRow]] = {}
     for run in newest.values():
         specs.setdefault(run.spec_hash, []).append(run)
-    differences: dict[str, dict[str, Any]] = {}
-    for kind in dict.fromkeys((found[0].method, found[0].environment) for found in specs.values()):
-        alike = {
-            spec: found[0].spec for spec, found in specs.items() if (found[0].method, found[0].environment) == kind
-        }
-        differences |= _differences(alike)
+    differences = spec_differences(runs)
     latest = latest_values(store, list(newest.values()), metrics)
     return [
         _comparison(sorted(found, key=lambda run: run.seed), differences[spec], metric, latest)
         for spec, found in specs.items()
         for metric in metrics
     ]
+
+
+def spec_differences(runs: Sequence[RunRow]) -> dict[str, dict[str, Any]]:
+    """By spec hash, the dotted keys in which specs of its method and environment differ, with its own values."""
+    kinds: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for run in runs:
+        kinds.setdefault((run.method, run.environment), {})[run.spec_hash] = run.spec
+    return {spec: keys for alike in kinds.values() for spec, keys in _differences(alike).items()}
 
 
 def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> dict[tuple[str, str], float]:

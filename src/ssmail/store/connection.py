@@ -25,11 +25,11 @@ def connect(where: str | Path) -> Engine:
 
     Raises InputError when it cannot be created or read, is no database of ssmail's, or has a newer schema.
     """
-    url = _as_url(where)
+    url = as_url(where)
     if url.get_backend_name() == "sqlite":
         _prepare_path(url)
     try:
-        engine = _engine(url)
+        engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
         raise InputError(
             f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
@@ -39,7 +39,7 @@ def connect(where: str | Path) -> Engine:
             _upgrade(engine)
     except DBAPIError as error:
         engine.dispose()
-        raise _translated(error, engine) from error
+        raise explained(error.orig, describe(engine)) from error
     except SsmailError:
         engine.dispose()
         raise
@@ -53,7 +53,7 @@ def reading(engine: Engine) -> Iterator[Connection]:
         with engine.connect() as connection:
             yield connection
     except DBAPIError as error:
-        raise _translated(error, engine) from error
+        raise explained(error.orig, describe(engine)) from error
 
 
 @contextmanager
@@ -65,7 +65,7 @@ def writing(engine: Engine) -> Iterator[Connection]:
             with connection.begin():
                 yield connection
     except DBAPIError as error:
-        raise _translated(error, engine) from error
+        raise explained(error.orig, describe(engine)) from error
 
 
 def describe(engine: Engine) -> str:
@@ -73,13 +73,8 @@ def describe(engine: Engine) -> str:
     return _show(engine.url)
 
 
-def _show(url: URL) -> str:
-    if url.get_backend_name() == "sqlite" and url.database:
-        return url.database
-    return url.render_as_string(hide_password=True)
-
-
-def _as_url(where: str | Path) -> URL:
+def as_url(where: str | Path) -> URL:
+    """The URL of a path or URL, with the absolute path of an SQLite file. Raises InputError for what is neither."""
     if isinstance(where, Path) or "://" not in where:
         return URL.create("sqlite", database=str(Path(where).expanduser().absolute()))
     try:
@@ -93,19 +88,8 @@ def _as_url(where: str | Path) -> URL:
     return url.set(database=str(Path(str(url.database)).absolute()))
 
 
-def _prepare_path(url: URL) -> None:
-    path = Path(str(url.database))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot create the folder {path.parent} for the database ({error.strerror}); choose a writable place"
-        ) from error
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
-
-
-def _engine(url: URL) -> Engine:
+def make_engine(url: URL) -> Engine:
+    """An engine with ssmail's settings, on whatever is there: nothing is checked or upgraded."""
     if url.get_backend_name() != "sqlite":
         return create_engine(url, isolation_level="SERIALIZABLE")
     engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
@@ -123,14 +107,7 @@ def _engine(url: URL) -> Engine:
     return engine
 
 
-def _is_current(engine: Engine) -> bool:
-    """Whether the schema is the newest known one; raises InputError when this version of ssmail cannot use it."""
-    with engine.connect() as connection:
-        revision = _revision(connection, engine)
-    return revision == REVISIONS[-1]
-
-
-def _revision(connection: Connection, engine: Engine) -> str | None:
+def revision_of(connection: Connection, engine: Engine) -> str | None:
     """The schema revision, or None in an empty database."""
     tables = set(inspect(connection).get_table_names())
     if not tables:
@@ -147,6 +124,43 @@ def _revision(connection: Connection, engine: Engine) -> str | None:
     return str(revision)
 
 
+def explained(error: BaseException | None, where: str) -> SsmailError:
+    """One sentence for what the driver of the database `where` refused."""
+    reason = str(error)
+    if "not a database" in reason or "malformed" in reason:
+        return InputError(f"{where} is not an SQLite database, or a damaged one ({reason}); give another file")
+    if "unable to open" in reason or "readonly" in reason:
+        return InputError(f"cannot write the database {where} ({reason}); choose a writable place")
+    if "locked" in reason:
+        return SsmailError(f"another program kept the database {where} to itself for {BUSY_SECONDS:.0f} s; close it")
+    return SsmailError(f"the database {where} refused an operation: {reason}")
+
+
+def _show(url: URL) -> str:
+    if url.get_backend_name() == "sqlite" and url.database:
+        return url.database
+    return url.render_as_string(hide_password=True)
+
+
+def _prepare_path(url: URL) -> None:
+    path = Path(str(url.database))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot create the folder {path.parent} for the database ({error.strerror}); choose a writable place"
+        ) from error
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
+
+
+def _is_current(engine: Engine) -> bool:
+    """Whether the schema is the newest known one; raises InputError when this version of ssmail cannot use it."""
+    with engine.connect() as connection:
+        revision = revision_of(connection, engine)
+    return revision == REVISIONS[-1]
+
+
 def _upgrade(engine: Engine) -> None:
     from alembic import command  # imported here because a database is seldom upgraded, and often opened
     from alembic.config import Config
@@ -156,7 +170,7 @@ def _upgrade(engine: Engine) -> None:
     config = Config()
     config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
     with writing(engine) as connection:
-        if _revision(connection, engine) != REVISIONS[-1]:  # another process may have been faster
+        if revision_of(connection, engine) != REVISIONS[-1]:  # another process may have been faster
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
 
@@ -176,15 +190,3 @@ def _use_wal(engine: Engine) -> None:
                 time.sleep(0.01)
     finally:
         connection.close()
-
-
-def _translated(error: DBAPIError, engine: Engine) -> SsmailError:
-    """One sentence for what the database driver refused."""
-    where, reason = describe(engine), str(error.orig)
-    if "not a database" in reason or "malformed" in reason:
-        return InputError(f"{where} is not an SQLite database, or a damaged one ({reason}); give another file")
-    if "unable to open" in reason or "readonly" in reason:
-        return InputError(f"cannot write the database {where} ({reason}); choose a writable place")
-    if "locked" in reason:
-        return SsmailError(f"another program kept the database {where} to itself for {BUSY_SECONDS:.0f} s; close it")
-    return SsmailError(f"the database {where} refused an operation: {reason}")

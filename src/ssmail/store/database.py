@@ -11,6 +11,7 @@ from sqlalchemy import Engine
 
 from ssmail.spec import RunSpec
 from ssmail.store import lifecycle, origin, queries, schema
+from ssmail.store.checkpoint_files import root_of
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.lifecycle import STALE_SECONDS
 from ssmail.store.queries import ArtifactRow, RunRow
@@ -33,8 +34,8 @@ class Store:
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
         on_sqlite = engine.dialect.name == "sqlite"
-        folder = Path(str(engine.url.database)).parent if on_sqlite else Path("results").absolute()
-        self.checkpoint_root = folder / "checkpoints"
+        file = Path(str(engine.url.database)) if on_sqlite else Path("results/ssmail.db").absolute()
+        self.checkpoint_root = root_of(file)
 
     @classmethod
     def open(cls, where: str | Path) -> Self:

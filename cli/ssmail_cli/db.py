@@ -1,0 +1,234 @@
+"""`ssmail db`: the database itself: what it holds, whether it is sound, copies of it, and others brought into it."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ssmail.errors import InputError
+from ssmail_cli import options
+from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, write_json
+
+if TYPE_CHECKING:
+    from ssmail.figures.needs import Needs
+    from ssmail.store.compact import Compact
+    from ssmail.store.information import DatabaseInformation
+    from ssmail.store.merging import Merge
+    from ssmail.store.run_contents import Difference
+
+app = typer.Typer(help="Inspect, check, back up, merge and export an SQLite database.", rich_markup_mode=None)
+
+COUNT_COLUMNS = {"environment": "env", "method": "method", "profile": "profile", "state": "state", "runs": "runs"}
+Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+PROBLEMS = 1
+
+
+@app.command()
+def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
+    """Show what the database holds.
+
+    The file, the revision of its schema, its size, how much of it the arrays are, and the runs by environment, method,
+    profile and state. It is not upgraded.
+    """
+    from ssmail.store.information import inform
+
+    found = inform(db)
+    kind = chosen_format(as_json, None)
+    rows = [asdict(count) for count in found.runs]
+    if kind is Format.JSON:
+        write_json({**asdict(found), "array_share": found.array_share, "runs": rows}, None)
+    elif kind is Format.CSV:
+        note(_summary(found))
+        print_rows(rows, COUNT_COLUMNS, kind)
+    else:
+        print(_summary(found))
+        print_table(rows, COUNT_COLUMNS)
+
+
+@app.command()
+def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
+    """Bring the tables to the newest schema.
+
+    A backup of the old state is written beside the file first. Any command that opens an older database upgrades it,
+    without a backup.
+    """
+    from ssmail.store.backup import upgrade as upgrade_database
+
+    done = upgrade_database(db)
+    if as_json:
+        write_json(asdict(done), None)
+    elif done.before == done.after:
+        print(f"{done.path} has the newest schema, {done.after}, already")
+    else:
+        kept = f"; the old state is in {done.backup}" if done.backup else ""
+        print(f"{done.path}: from schema {done.before or 'none'} to {done.after}{kept}")
+
+
+@app.command()
+def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
+    """Look for problems, in the database and in the checkpoints beside it.
+
+    Prints one line for each, with its remedy, and changes nothing. Exit code 0: none, 1: some. It reads the whole file
+    and all checkpoints, and may be used while runs are being computed.
+    """
+    from ssmail.store.checks import check as check_database
+
+    problems = check_database(db)
+    if as_json:
+        write_json([asdict(problem) for problem in problems], None)
+    for problem in problems if not as_json else ():
+        print(f"{problem.check}: {problem.problem}; {problem.remedy}")
+    note(f"{db}: {_count(len(problems), 'problem')}" if problems else f"{db}: no problem found")
+    if problems:
+        raise typer.Exit(PROBLEMS)
+
+
+@app.command()
+def backup(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write; it must not exist.")],
+    as_json: Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Copy the database to a new file.
+
+    Safe while runs are being computed. Checkpoints are files of their own and are not copied.
+    """
+    from ssmail.store.backup import back_up
+
+    size = back_up(db, file)
+    if as_json:
+        write_json({"path": file, "size_bytes": size}, None)
+    else:
+        print(f"wrote {file}, {_size(size)}")
+
+
+@app.command()
+def merge(
+    other: Annotated[str, typer.Argument(metavar="OTHER.db", help="The database to take runs from; it is only read.")],
+    as_json: Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Bring the runs of another database into this one.
+
+    With their checkpoints, and all of them or none. Of two runs of one spec, seed and data the one that got further is
+    kept; of two that ended, the first, and if they differ that is reported. Runs that are being computed are left out.
+    """
+    from ssmail.store.merging import merge as merge_databases
+
+    done = merge_databases(db, other)
+    if as_json:
+        write_json(_merge_json(done), None)
+        return
+    for difference in done.differences:
+        print(_difference(difference))
+    print(f"merged {done.other} into {done.target}: {_fates(done)}")
+    if done.without_checkpoints:
+        note(f"{_count(len(done.without_checkpoints), 'run')} came without all checkpoints: {other} lacks them")
+
+
+@app.command()
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write; it must not exist.")],
+    compact: Annotated[
+        bool, typer.Option("--compact", help="Only what figures need. (For a whole copy: ssmail db backup.)")
+    ] = False,
+    method: options.Method = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    figure: options.Figure = None,
+    as_json: Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Write a small database of runs that ended, from which the figures can be drawn.
+
+    The newest finished or diverged run of each spec and seed, with the last value of every metric, the curves and
+    arrays that figures show, and no checkpoints. What is left out is told.
+    """
+    from ssmail.figures.needs import needs
+    from ssmail.store import Store
+    from ssmail.store.compact import export_compact, settled_cells
+    from ssmail.store.sqlite_file import existing, require_current
+
+    if not compact:
+        raise InputError("give --compact to export what figures need; `ssmail db backup FILE` copies everything.")
+    require_current(existing(db))
+    store = Store.open(db)
+    matching = options.select_runs(store, None, method, environment, profile, None, figure)
+    runs = settled_cells(matching)
+    if not runs:
+        raise InputError(f"no finished or diverged run in {db} meets these conditions; `ssmail runs list` shows all.")
+    needed = needs(store, runs)
+    done = export_compact(db, file, runs, needed.wanted)
+    others = len(store.runs()) - len(runs)
+    if as_json:
+        write_json({**asdict(done), "left_out_runs": others, "undrawable": needed.undrawable}, None)
+    else:
+        _tell(done, needed, others)
+
+
+def _summary(found: "DatabaseInformation") -> str:
+    revision = found.revision or "none"
+    if found.revision != found.newest_revision:
+        revision += f" ({found.newest_revision} is the newest; `ssmail db upgrade`)"
+    runs = _count(sum(count.runs for count in found.runs), "run")
+    return (
+        f"{found.path}: schema {revision}, {_size(found.size_bytes)} ({_size(found.free_bytes)} of it free), {runs}\n"
+        f"{_count(found.metrics, 'value')} of metrics; {_count(found.arrays, 'array')}, {_size(found.array_bytes)} "
+        f"({100 * found.array_share:.0f} % of the size); {_count(found.artifacts, 'checkpoint file')}"
+    )
+
+
+def _fates(done: "Merge") -> str:
+    """ "3 runs added, 2 already there"; every fate that some run had."""
+    from ssmail.store.merging import Fate
+
+    words = {
+        Fate.ADDED: "added",
+        Fate.REPLACED: "put in the place of runs that had less",
+        Fate.ALREADY_THERE: "there already",
+        Fate.BEHIND: "left out: less far than the run that is there",
+        Fate.BUSY: "left out: being computed",
+        Fate.DIFFERENT: "left out: different from the run that is there",
+    }
+    counts = [f"{_count(done.count(fate), 'run')} {text}" for fate, text in words.items() if done.count(fate)]
+    return ", ".join(counts) or "no runs in it"
+
+
+def _difference(found: "Difference") -> str:
+    where = f" at epoch {found.step}" if found.step is not None else ""
+    kept, left_out = ("absent" if value is None else value for value in (found.kept_value, found.left_out_value))
+    return (
+        f"nondeterminism: {found.method} on {found.environment}, spec {found.spec_hash[:8]}, seed {found.seed}: "
+        f"{found.metric}{where} is {kept} in run {found.kept[:8]}, which is kept, and {left_out} in run "
+        f"{found.left_out[:8]}, which is left out"
+    )
+
+
+def _merge_json(done: "Merge") -> dict[str, Any]:
+    verdicts = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.verdicts]
+    differences = [asdict(difference) for difference in done.differences]
+    names = {"target": done.target, "other": done.other}
+    return {**names, "runs": verdicts, "differences": differences, "without_checkpoints": done.without_checkpoints}
+
+
+def _tell(done: "Compact", needed: "Needs", others: int) -> None:
+    """The file on stdout, what is not in it on stderr."""
+    print(f"wrote {done.path}, {_size(done.size_bytes)}: {_count(done.runs, 'run')}")
+    note(
+        f"left out: {_count(others, 'other run')}; {_count(done.left_out_artifacts, 'checkpoint file')}; "
+        f"{_count(done.left_out_metrics, 'value')} of metrics (kept: every last one, and the curves of "
+        f"{', '.join(sorted(needed.wanted.curves))}); {_count(done.left_out_arrays, 'array')} (kept: {done.arrays}, of "
+        f"{done.thinned} of them the part that is drawn)"
+    )
+    for figure, reason in needed.undrawable.items():
+        note(f"{figure} cannot be drawn from it ({reason.removesuffix('.')})")
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _size(size: int) -> str:
+    """Bytes for people: "12 kB", "8.9 MB"."""
+    return f"{size / 1e3:.0f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"

@@ -1,0 +1,124 @@
+"""`ssmail explain`: what a saved figure is drawn from, and whether the database still agrees."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ssmail_cli import options
+from ssmail_cli.display import Format, chosen_format, note, print_rows, short, write_json
+
+if TYPE_CHECKING:
+    from ssmail.figures.explanation import Agreement, Explanation
+
+DISAGREES = 1
+COLUMNS = {
+    "curve": "curve",
+    "run": "run",
+    "seed": "seed",
+    "state": "state",
+    "spec": "spec",
+    "differs": "differs",
+    "data": "data",
+    "code": "code",
+    "database": "database",
+}
+
+
+def explain(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A figure that ssmail saved (PNG, PDF, SVG), or the CSV beside it.")
+    ],
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Tell what a saved figure is drawn from.
+
+    The runs behind each curve, with the spec (and in what the specs of a method differ), data and code of each, and
+    whether the database still agrees: the same runs, and the same values when the figure is collected from them again.
+    Exit code 0: it agrees, or cannot be asked; 1: it does not.
+    """
+    from ssmail.figures.explanation import compare
+    from ssmail.figures.explanation import explain as explain_figure
+
+    found = explain_figure(file)
+    agreement = None if options.is_missing(db) else compare(found, options.open_store(db))
+    kind = chosen_format(as_json, form)
+    if kind is Format.JSON:
+        write_json(_as_json(found, agreement), None)
+    else:
+        say = print if kind is Format.TABLE else note
+        for line in (*_heading(found), _verdict(agreement, db)):
+            say(line)
+        if rows := _rows(found, agreement):
+            print_rows(rows, COLUMNS, kind)
+    if agreement is not None and agreement.agrees is False:
+        raise typer.Exit(DISAGREES)
+
+
+def _heading(found: "Explanation") -> list[str]:
+    source = found.provenance
+    about = "".join(f", {name} {short(value)}" for name, value in source.options.items())
+    lines = [f"{found.path}: {source.figure}{about}; drawn with ssmail {source.drawn_with}"]
+    lines += [f"code of the runs: {', '.join(source.code)}"] if source.code else []
+    lines += [f"data: {', '.join(source.dataset_hashes)}"] if source.dataset_hashes else []
+    states = {"as written": "as it was written with the figure", "altered": "altered since", "missing": "missing"}
+    lines += [f"CSV: {found.csv.name} is {states[found.csv_state]}"] if found.csv_state else []
+    return lines
+
+
+def _verdict(agreement: "Agreement | None", db: str) -> str:
+    if agreement is None:
+        return f"there is no database {db} to compare with; name one with --db"
+    changed = sum(state not in ("same", "missing") for state in agreement.runs.values())
+    missing = sum(state == "missing" for state in agreement.runs.values())
+    parts = [f"{missing} runs are missing"] * bool(missing) + [f"{changed} runs have changed"] * bool(changed)
+    if agreement.agrees:
+        return f"{agreement.where} agrees: all runs are there, and give the same values"
+    if agreement.values == "different":
+        parts.append(f"the values differ: {agreement.reason}")
+    if agreement.agrees is False:
+        return f"{agreement.where} does not agree: {'; '.join(parts)}"
+    return f"{agreement.where} cannot tell: {agreement.reason}"
+
+
+def _rows(found: "Explanation", agreement: "Agreement | None") -> list[dict[str, Any]]:
+    """A row for each run, with short ids and hashes."""
+    source = found.provenance
+    states = agreement.runs if agreement is not None else {}
+    rows: list[dict[str, Any]] = [
+        {
+            "curve": run.curve,
+            "run": run.id[:8],
+            "method": run.method,
+            "environment": run.environment,
+            "profile": run.profile,
+            "seed": run.seed,
+            "state": run.state,
+            "spec": run.spec_hash[:8],
+            "differs": ", ".join(
+                f"{key.rpartition('.')[2]} {short(value)}"
+                for key, value in source.differs.get(run.spec_hash, {}).items()
+            ),
+            "data": (run.dataset_hash or "")[:8],
+            "code": _short_code(run.code),
+            "database": states.get(run.id),
+        }
+        for run in source.runs
+    ]
+    return rows or [{"run": run_id[:8], "database": states.get(run_id)} for run_id in source.run_ids]
+
+
+def _short_code(code: str) -> str:
+    """ "0.1.0+703fd585", with "-dirty" where it stands."""
+    version, plus, commit = code.partition("+")
+    dirty = "-dirty" if commit.endswith("-dirty") else ""
+    return f"{version}{plus}{commit[:8]}{dirty}"
+
+
+def _as_json(found: "Explanation", agreement: "Agreement | None") -> dict[str, Any]:
+    csv = {"path": found.csv, "state": found.csv_state}
+    database = None if agreement is None else {**asdict(agreement), "agrees": agreement.agrees}
+    return {"path": found.path, **asdict(found.provenance), "csv": csv, "database": database}
