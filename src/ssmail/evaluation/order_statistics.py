@@ -1,8 +1,8 @@
-"""Intervals and tests that need nothing but the order of a few runs' values, so that a diverged run (+-inf) has a place.
+"""Intervals and tests that need nothing but the order of a few runs' values, where a diverged run (+-inf) has a place.
 
-All tests are one-sided and exact; every interval is two-sided with CONFIDENCE = 1 - 2 * ALPHA, so each of its ends is the
-bound that a one-sided test at ALPHA would not reject. What the order of n values cannot say is infinite: the interval of
-the median of four values reaches from -inf to inf.
+All tests are one-sided and exact; every interval is two-sided with CONFIDENCE = 1 - 2 * ALPHA, so each of its ends is
+the bound that a one-sided test at ALPHA does not reject. What the order of n values cannot say is infinite: the
+interval of the median of four values reaches from -inf to inf.
 """
 
 import math
@@ -52,7 +52,7 @@ def median(values: npt.ArrayLike) -> Estimate:
     """Median of (R,) values and the interval between two order statistics that the sign test does not reject."""
     table = np.sort(np.asarray(values, dtype=np.float64))
     count = len(table)
-    place = sum(bdtr(k, count, 0.5) <= ALPHA for k in range(count))  # how many values lie outside at each end
+    place = int((bdtr(np.arange(count), count, 0.5) <= ALPHA).sum())
     return _between(table, place)
 
 
@@ -89,7 +89,7 @@ def shift(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:
 
 
 def superiority(first: npt.ArrayLike, second: npt.ArrayLike) -> float:
-    """Share of the pairs in which the run of `second` (R2,) has the greater value than that of `first` (R1,), ties half."""
+    """Share of the pairs in which the run of `second` (R2,) exceeds that of `first` (R1,), ties half."""
     a, b = np.asarray(first, dtype=np.float64)[:, None], np.asarray(second, dtype=np.float64)[None]
     return float(np.mean((b > a) + 0.5 * (b == a)))
 
@@ -98,8 +98,8 @@ def deviations(values: npt.ArrayLike) -> Floats:
     """Distances of (R,) values from their median, ascending, without the smallest: (R - 1,); for tests of spread.
 
     The smallest says nothing: it is 0 by construction for an odd R, and equal to the next for an even one (the
-    "structural zero" of Brown and Forsythe's test; Hines and Hines 2000). A diverged run is infinitely far away, and once
-    half of the runs diverged all are.
+    "structural zero" of Brown and Forsythe's test; Hines and Hines 2000). A diverged run is infinitely far away, and
+    once half of the runs diverged all are.
     """
     table = np.asarray(values, dtype=np.float64)
     centre = float(np.median(table)) if np.isfinite(table).sum() > len(table) / 2 else math.inf
@@ -109,7 +109,7 @@ def deviations(values: npt.ArrayLike) -> Floats:
 
 
 def rank_sums(first: int, second: int) -> Floats:
-    """P(U = u) of the Mann-Whitney statistic without ties, (first * second + 1,): coefficients of a Gaussian binomial."""
+    """P(U = u) of the Mann-Whitney statistic without ties, (first * second + 1,): a Gaussian binomial's terms."""
     counts = np.zeros(first * second + 1)
     counts[0] = 1
     for k in range(1, first + 1):

@@ -1,4 +1,4 @@
-"""C1, stability (section 4.2, Figure 4): SS-AIL converges from every initialisation, GAIL and WAIL do not and fluctuate.
+"""C1, stability (section 4.2, Figure 4): SS-AIL converges for every seed, GAIL and WAIL do not, and fluctuate.
 
 The paper's error is of training; a policy that converged has a small validation error as well, so both are asked for.
 "Converges to zero" becomes: a tenth of what driving straight on costs. "Fluctuates" is measured on the logarithm of the
@@ -33,7 +33,7 @@ FLUCTUATION = "mean |ln(error / error of the epoch before)| of train/mode_mse ov
 
 def remaining_error(train: Floats, validation: Floats, constant_velocity: float) -> float:
     """What is left of the error: see ERROR. train and validation: (E,) squared scaled units."""
-    return max(end(train), end(validation)) / constant_velocity
+    return float(np.maximum(end(train), end(validation)) / constant_velocity)
 
 
 def fluctuation(errors: Floats) -> float:

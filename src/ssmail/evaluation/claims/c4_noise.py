@@ -17,7 +17,9 @@ CLAIM = Claim(
     figure="fig7",
 )
 
-GROWTH = "slope of the least-squares line through test_noisy/mse over all predicted steps, squared scaled units per step"
+GROWTH = (
+    "slope of the least-squares line through test_noisy/mse over all predicted steps, squared scaled units per step"
+)
 SPREADING = "likewise of test_noisy/mse_spread, the standard deviation over test windows"
 LATE = "slope of test_noisy/mse over the last half of the predicted steps, squared scaled units per step"
 BENDING = "slope of test_noisy/mse over the last half of the predicted steps minus that over the first half"

@@ -13,8 +13,8 @@ from ssmail.evaluation.claims.verdicts import Claim, Part, Sample
 CLAIM = Claim(
     name="C6",
     alias="curricula",
-    sentence="Trajectory forcing lengthens the generated segments gradually over training, more smoothly than scheduled "
-    "sampling does.",
+    sentence="Trajectory forcing lengthens the generated segments gradually over training, more smoothly than "
+    "scheduled sampling does.",
     section="3.3",
     figure="fig3",
 )
@@ -31,7 +31,7 @@ def growth(lengths: Floats) -> float:
 
 
 def largest_jump(lengths: Floats) -> float:
-    """See JUMP; of (E,) lengths in steps. The whole rise is from the shortest to the longest; NaN when there is none."""
+    """See JUMP; of (E,) lengths in steps. The whole rise is from shortest to longest; NaN when there is none."""
     whole = np.ptp(lengths) if len(lengths) > 1 else 0.0
     return float(np.diff(lengths).max() / whole) if whole > 0 else np.nan
 

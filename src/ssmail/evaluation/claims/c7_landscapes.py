@@ -10,8 +10,8 @@ from ssmail.evaluation.claims.verdicts import Claim, Part, Sample
 CLAIM = Claim(
     name="C7",
     alias="landscapes",
-    sentence="GAIL's reward is almost constant but for a sliver at its boundary; SS-AIL's has a clear slope towards the "
-    "expert everywhere.",
+    sentence="GAIL's reward is almost constant but for a sliver at its boundary; SS-AIL's has a clear slope towards "
+    "the expert everywhere.",
     section="1",
     figure="fig1",
 )

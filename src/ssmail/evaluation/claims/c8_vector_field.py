@@ -1,5 +1,5 @@
-"""C8, vector field (section 3.1.3, Figure 2): behind the current trajectory, the slope of D points to the expert only if
-D has seen negative alpha.
+"""C8, vector field (section 3.1.3, Figure 2): behind the current trajectory, the slope of D points to the expert only
+if D has seen negative alpha.
 
 Behind is where alpha is negative: on the far side of the current trajectory, seen from the expert.
 """
@@ -24,6 +24,8 @@ COSINE = "landscape/behind_cosine: mean cosine between D's slope and the directi
 def decide(positive: Sample, both: Sample) -> tuple[Part, ...]:
     """From the cosines of alpha in POSITIVE and in BOTH."""
     return (
-        typical("without negative alpha the field behind does not point to the expert", COSINE, positive, "below", TOWARDS),
+        typical(
+            "without negative alpha the field behind does not point to the expert", COSINE, positive, "below", TOWARDS
+        ),
         typical("with negative alpha it does", COSINE, both, "above", TOWARDS),
     )
