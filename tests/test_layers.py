@@ -17,6 +17,7 @@ FLOORS = (
     ("store",),
     ("execution",),
     ("figures",),
+    ("evidence",),
     ("ssmail_cli",),
 )
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}

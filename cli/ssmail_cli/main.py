@@ -10,7 +10,7 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
-from ssmail_cli import ablate, data, db, explain, mocap, plot, reproduce, runs, train
+from ssmail_cli import ablate, claims, data, db, explain, mocap, plot, reproduce, runs, train
 from ssmail_cli.display import complaint
 
 INTERRUPTED = 130
@@ -32,6 +32,7 @@ app.command("ablate-alpha")(ablate.alias("alpha"))
 app.command("ablate-beta")(ablate.alias("beta"))
 app.command("reproduce")(reproduce.reproduce)
 app.command("plot")(plot.plot)
+app.command("claims")(claims.claims)
 app.command("explain")(explain.explain)
 app.add_typer(runs.app, name="runs")
 app.add_typer(db.app, name="db")

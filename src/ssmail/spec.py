@@ -356,6 +356,9 @@ LATER: tuple[tuple[str, str, Any], ...] = (
     ("self_supervision", "label", "identity"),
     ("data", "letters", None),
     ("model", "initial_scale", 0.1),
+    ("model", "standardize", False),
+    ("sac", "encoder_steps", None),
+    *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
 )
 """(section, key, value) of what runs of earlier versions had without a name for it."""
 

@@ -1,0 +1,194 @@
+"""`ssmail claims`: what the stored runs say of each claim of the paper."""
+
+import shutil
+import textwrap
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ssmail_cli import options
+from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_json
+
+if TYPE_CHECKING:
+    from ssmail.evaluation.claims.verdicts import Part, Sample
+    from ssmail.evidence import Judgement
+
+SUMMARY = {
+    "claim": "claim",
+    "alias": "",
+    "verdict": "verdict",
+    "p": "p",
+    "corrected": "of all eight (Holm)",
+    "p_holm": "p (Holm)",
+    "more_seeds": "more seeds",
+}
+WIDEST = 120  # columns of text
+
+
+def claims(
+    only: Annotated[
+        str | None,
+        typer.Option(
+            "--only",
+            metavar="CLAIM[,CLAIM...]",
+            help="These claims alone, as C1 or stability.",
+            show_default="all of them",
+        ),
+    ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option("--profile", help="Runs of this profile.", show_default="the one that each figure draws"),
+    ] = None,
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Judge the paper's claims C1 to C8 by the stored runs: supported, contradicted or inconclusive.
+
+    Each part of a claim has a statistic and an exact test, defined beforehand (docs/claims.md), at 0.05 for each claim;
+    the last columns correct for all eight. Every seed counts. CSV has a row for each part, JSON everything.
+    """
+    from ssmail.evidence import judge
+
+    store = options.open_store(db)
+    wanted = [name.strip() for name in only.split(",")] if only is not None else None
+    judgements = judge(store, profile, wanted)
+    kind = chosen_format(as_json, form)
+    if kind is Format.JSON:
+        write_json([_nested(found) for found in judgements], None)
+        return
+    for found in judgements:
+        for remark in found.notes:
+            note(f"{found.claim.name}: {remark}")
+    if kind is Format.CSV:
+        print_rows([row for found in judgements for row in _part_rows(found)], dict.fromkeys(_PART_COLUMNS, ""), kind)
+        return
+    for found in judgements:
+        typer.echo("\n".join([*_told(found), ""]))
+    print_table([_summary(found) for found in judgements], SUMMARY)
+
+
+_PART_COLUMNS = (
+    *("claim", "alias", "claim_verdict", "claim_p", "claim_p_holm", "statement", "verdict", "effect", "low", "high"),
+    *("effect_is", "p_for", "p_against", "more_seeds", "reason", "statistic", "test", "samples"),
+)
+
+
+def _summary(found: "Judgement") -> dict[str, Any]:
+    """A claim as a row."""
+    decision = found.decision
+    more = "no number" if decision.more_seeds is None else decision.more_seeds
+    return {
+        "claim": found.claim.name,
+        "alias": found.claim.alias,
+        "verdict": found.verdict.value,
+        "p": decision.p,
+        "corrected": found.corrected.value,
+        "p_holm": found.p_holm,
+        "more_seeds": "no runs" if not found.runs else more,
+    }
+
+
+def _nested(found: "Judgement") -> dict[str, Any]:
+    """A claim with all that is known of it."""
+    claim, decision = found.claim, found.decision
+    return {
+        "claim": claim.name,
+        "alias": claim.alias,
+        "sentence": claim.sentence,
+        "section": claim.section,
+        "figure": claim.figure,
+        "verdict": found.verdict.value,
+        "p": decision.p,
+        "p_for": decision.p_for,
+        "p_against": decision.p_against,
+        "corrected_verdict": found.corrected.value,
+        "p_holm": found.p_holm,
+        "more_seeds": decision.more_seeds,
+        "command": found.command,
+        "profile": found.profile,
+        "runs": found.runs,
+        "notes": found.notes,
+        "parts": [_part_value(part) for part in decision.parts],
+    }
+
+
+def _part_value(part: "Part") -> dict[str, Any]:
+    return {
+        "statement": part.statement,
+        "verdict": part.verdict.value,
+        "effect": part.effect.value,
+        "low": part.effect.low,
+        "high": part.effect.high,
+        "effect_is": part.effect_is,
+        "p_for": part.p_for,
+        "p_against": part.p_against,
+        "more_seeds": part.more_seeds,
+        "reason": part.reason,
+        "statistic": part.statistic,
+        "test": part.test,
+        "samples": [
+            {"label": sample.label, "seeds": sample.seeds, "values": sample.values, "runs": sample.runs}
+            for sample in part.samples
+        ],
+    }
+
+
+def _part_rows(found: "Judgement") -> Iterator[dict[str, Any]]:
+    """A claim's parts as rows."""
+    decision = found.decision
+    verdict = {"claim_verdict": found.verdict.value, "claim_p": decision.p, "claim_p_holm": found.p_holm}
+    claim = {"claim": found.claim.name, "alias": found.claim.alias, **verdict}
+    yield from (claim | _part_value(part) for part in decision.parts)
+
+
+def _told(found: "Judgement") -> list[str]:
+    """A claim as lines of text."""
+    claim = found.claim
+    lines = [f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}"]
+    lines += _wrapped(claim.sentence, 2)
+    for part in found.decision.parts:
+        lines += _part_lines(part)
+    if found.runs:
+        lines += _wrapped(f"runs of profile {found.profile}: {' '.join(run[:8] for run in found.runs)}", 2)
+    if found.command:
+        lines += _wrapped(f"next: {found.command}", 2)
+    return lines
+
+
+def _part_lines(part: "Part") -> list[str]:
+    lines = [
+        f"  - {part.statement}: {part.verdict}{_need(part)}",
+        *_wrapped(part.statistic, 6),
+        *_wrapped(part.test, 6),
+    ]
+    if not part.reason:
+        value, low, high = (short(float(number), 3) for number in part.effect)
+        chances = f"p = {short(part.p_for, 2)} in favour, {short(part.p_against, 2)} against"
+        lines += _wrapped(f"{part.effect_is}: {value}, 90 % interval {low} to {high}; {chances}", 6)
+    for sample in part.samples:
+        lines += _wrapped(_seeds(sample), 6)
+    return lines
+
+
+def _need(part: "Part") -> str:
+    """What an inconclusive part lacks."""
+    if part.reason:
+        return f", {part.reason}"
+    if part.more_seeds is None:
+        return ", and no number of seeds is expected to settle it"
+    return f", {part.more_seeds} more seed{'s' * (part.more_seeds > 1)} may settle it" if part.more_seeds else ""
+
+
+def _seeds(sample: "Sample") -> str:
+    """Every seed's value."""
+    values: Sequence[tuple[int, float]] = list(zip(sample.seeds, sample.values, strict=True))
+    told = ", ".join(f"{seed}: {short(value, 3)}" for seed, value in values)
+    return f"{sample.label}, seed by seed: {told or 'no runs'}"
+
+
+def _wrapped(text: str, indent: int) -> list[str]:
+    width = min(shutil.get_terminal_size().columns, WIDEST)
+    margin = " " * indent
+    return textwrap.wrap(text, width, initial_indent=margin, subsequent_indent=margin, break_on_hyphens=False)

@@ -1,0 +1,85 @@
+"""`ssmail claims`: verdicts as text, CSV and JSON."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from ssmail.experiments import ablation_specs
+from ssmail.store import RunState, Store
+from tests.cli.command_line import CommandLine
+
+ERRORS = {
+    0.0: (0.020, 0.024, 0.028, 0.032, 0.036),
+    0.15: (0.0020, 0.0021, 0.0022, 0.0023, 0.0024),
+    1.0: (0.020, 0.025, 0.030, 0.035, 0.040),
+}
+
+
+@pytest.fixture
+def beta(db: Path) -> Path:
+    """A database in which C3 is true and nothing else can be told."""
+    store = Store.open(db)
+    specs = ablation_specs("beta", "smoke", values=list(ERRORS))
+    for value, errors in ERRORS.items():
+        for seed, error in enumerate(errors):
+            writer = store.start_run(specs[value], seed, dataset_hash="d" * 64, device="cpu")
+            writer.epoch(1, {"train/mode_mse": error})
+            writer.final(1, {"test/mode_mse": error})
+            writer.finish(RunState.FINISHED)
+    store.close()
+    return db
+
+
+def test_json_has_everything(cli: CommandLine, beta: Path) -> None:
+    found = cli("claims", "--json", "--only", "C3,alpha", "--db", beta)
+    assert (found.code, found.err) == (0, "")
+    claim, alpha = json.loads(found.out)
+    assert (alpha["claim"], alpha["verdict"], alpha["runs"]) == ("C5", "inconclusive", [])
+    assert alpha["command"] == "ssmail reproduce --only fig8 --profile quick --seeds 0-4"
+    assert (claim["verdict"], claim["corrected_verdict"], claim["section"]) == ("supported", "inconclusive", "4.5")
+    assert claim["p_holm"] == pytest.approx(8 * claim["p"])
+    assert len(claim["runs"]) == 15
+    lower = claim["parts"][0]
+    assert lower["p_for"] == pytest.approx(1 / 252)
+    assert lower["low"] < lower["effect"] < lower["high"]
+    assert lower["samples"][0]["values"] == list(ERRORS[0.15])
+    assert lower["samples"][0]["seeds"] == [0, 1, 2, 3, 4]
+
+
+def test_csv_has_a_row_for_each_part(cli: CommandLine, beta: Path) -> None:
+    found = cli("claims", "--db", beta)
+    assert found.code == 0
+    assert [row["claim"] for row in found.rows] == [
+        c for c, n in zip("12345678", (5, 3, 3, 4, 2, 2, 3, 2), strict=True) for c in [f"C{c}"] * n
+    ]
+    supported = [row for row in found.rows if row["verdict"] == "supported"]
+    assert {row["claim"] for row in supported} == {"C3"}
+    assert {row["claim_verdict"] for row in supported} == {"supported"}
+    assert json.loads(supported[0]["samples"])[1]["label"] == "beta 0"
+    assert "C3: missing of curriculum.beta" in found.err
+
+
+def test_the_text_tells_the_verdict_every_seed_and_what_is_missing(cli: CommandLine, beta: Path) -> None:
+    text = " ".join(cli("claims", "--format", "table", "--db", beta).out.split())
+    assert "C3 beta (section 4.5, fig6): supported" in text
+    assert "beta 0.15, seed by seed: 0: 0.002, 1: 0.0021, 2: 0.0022, 3: 0.0023, 4: 0.0024" in text
+    assert "gail does not converge: inconclusive, no runs of gail" in text
+    assert "next: ssmail reproduce --only fig8 --profile quick --seeds 0-4" in text
+
+
+def test_another_profile_has_no_runs(cli: CommandLine, beta: Path) -> None:
+    (claim,) = json.loads(cli("claims", "--json", "--only", "C3", "--profile", "paper", "--db", beta).out)
+    assert (claim["verdict"], claim["runs"]) == ("inconclusive", [])
+
+
+def test_a_misspelt_claim_is_answered_with_the_nearest(cli: CommandLine, beta: Path) -> None:
+    assert (
+        cli("claims", "--only", "stabilty", "--db", beta).sentence
+        == "unknown claim 'stabilty'; did you mean stability?"
+    )
+
+
+def test_a_missing_database_is_not_made(cli: CommandLine, db: Path) -> None:
+    assert "there is no database" in cli("claims", "--db", db).sentence
+    assert not db.exists()
