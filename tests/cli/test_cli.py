@@ -33,6 +33,7 @@ def test_the_commands_are_those_of_the_documentation() -> None:
     assert {path.removeprefix("ssmail").strip() for path in COMMANDS} == {
         "",
         "generate-yjunction",
+        "generate-letters",
         "prep-mocap",
         "train",
         "ablate",
