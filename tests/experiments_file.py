@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from ssmail.experiments import load_experiments
+from ssmail.experiments_file import load_experiments
 
 SHIPPED = load_experiments()
 

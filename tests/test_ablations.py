@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.experiments import ablation, ablation_specs, as_written, build_spec, frozen, leaves
+from ssmail.experiments import ablation, ablation_specs, as_written, build_spec, frozen
+from ssmail.spec_keys import leaves
 
 from .experiments_file import SHIPPED, write
 

@@ -9,14 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssmail.errors import InputError
-from ssmail.experiments import (
-    ENVIRONMENT_VARIABLE,
-    FigureRequirements,
-    ablation,
-    build_spec,
-    figure_requirements,
-    load_experiments,
-)
+from ssmail.experiments import FigureRequirements, ablation, build_spec, figure_requirements
+from ssmail.experiments_file import ENVIRONMENT_VARIABLE, load_experiments
 from ssmail.spec import RunSpec
 
 from .experiments_file import SHIPPED, write

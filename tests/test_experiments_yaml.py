@@ -4,7 +4,8 @@ import itertools
 
 import pytest
 
-from ssmail.experiments import ablation_specs, as_written, build_spec, figure_requirements, load_experiments
+from ssmail.experiments import ablation_specs, as_written, build_spec, figure_requirements
+from ssmail.experiments_file import load_experiments
 from ssmail.spec import ENVIRONMENTS, METHODS, RunSpec
 
 EXPERIMENTS = load_experiments()

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import ENVIRONMENT_VARIABLE, function_folders
+from ssmail.experiments import function_folders
+from ssmail.experiments_file import ENVIRONMENT_VARIABLE
 from ssmail.store import Store
 from ssmail.user_functions import UserFunction, pinned
 from ssmail_cli.main import run

@@ -9,6 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     ("errors", "shaping", "spec", "spec_keys", "strict_yaml", "user_functions"),
+    ("experiments_file",),
     ("experiments",),
     ("data", "envs"),
     ("models",),

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.experiments import ENVIRONMENT_VARIABLE, ablation, ablation_specs, build_spec
+from ssmail.experiments import ablation, ablation_specs, build_spec
+from ssmail.experiments_file import ENVIRONMENT_VARIABLE
 from ssmail.spec import RunSpec, used
 from ssmail.user_functions import UserFunction, load, pinned
 

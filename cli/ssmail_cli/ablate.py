@@ -111,7 +111,8 @@ def _column(key: str) -> str:
 
 def _point_to_figures(name: str, environment: str | None, db: str) -> None:
     """A line for each figure that draws the ablation, on that environment."""
-    from ssmail.experiments import ablation, figure_requirements, load_experiments
+    from ssmail.experiments import ablation, figure_requirements
+    from ssmail.experiments_file import load_experiments
     from ssmail.figures import FIGURES
 
     trained = ablation(name, environment).environment

@@ -23,8 +23,8 @@ Formats = Annotated[
 
 def check_formats(formats: Sequence[str]) -> None:
     """Raise InputError for a format that figures are not written in."""
-    from ssmail.experiments import unknown_name
     from ssmail.figures.provenance import FORMATS
+    from ssmail.spec_keys import unknown_name
 
     for form in formats:
         if form not in FORMATS:
@@ -34,8 +34,8 @@ def check_formats(formats: Sequence[str]) -> None:
 def parse_statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
     """The statistic of that name. Raises InputError for an unknown one, and when none of the figures shows any."""
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.experiments import unknown_name
     from ssmail.figures import FIGURES
+    from ssmail.spec_keys import unknown_name
 
     if stat is None:
         return None

@@ -184,8 +184,8 @@ def _check_runs(names: Sequence[str], ids: Sequence[str] | None, profile: str | 
 
 def _check_figures(figures: Sequence[str]) -> None:
     """Refuse unknown names."""
-    from ssmail.experiments import unknown_name
     from ssmail.figures import FIGURES
+    from ssmail.spec_keys import unknown_name
 
     for name in figures:
         others = (ALL, TRAINING, SKELETON, *OF_A_RUN)
@@ -219,7 +219,8 @@ def _chosen(
     profile: str | None,
 ) -> "list[RunRow]":
     """The runs that meet every condition, newest last. Raises InputError when there is none, or an unknown name."""
-    from ssmail.experiments import load_experiments, unknown_name
+    from ssmail.experiments_file import load_experiments
+    from ssmail.spec_keys import unknown_name
 
     runs = store.runs(ids=ids, environment=environment, profile=profile)
     for method in methods or []:

@@ -83,8 +83,9 @@ def reproduce(
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.execution.figure_cells import figure_cells
-    from ssmail.experiments import load_experiments, unknown_name
+    from ssmail.experiments_file import load_experiments
     from ssmail.figures import FIGURES
+    from ssmail.spec_keys import unknown_name
 
     listed = load_experiments().figures
     choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}

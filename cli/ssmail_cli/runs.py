@@ -206,7 +206,7 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The same, flat: section, name, step (of a metric), value."""
-    from ssmail.experiments import leaves
+    from ssmail.spec_keys import leaves
 
     for section in ("run", "spec"):
         for name, value in leaves(details[section]):

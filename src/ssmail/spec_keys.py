@@ -31,6 +31,20 @@ def nearest(name: str, choices: Iterable[str]) -> str:
     return f"did you mean {near[0]}?" if near else f"choose from {', '.join(choices)}."
 
 
+def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
+    """The error for a misspelt name: one sentence with the nearest of `choices`, or all of them."""
+    return InputError(f"unknown {kind} '{name}'; {nearest(name, choices)}")
+
+
+def leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted key, value) of every value that is not a mapping with keys."""
+    for key, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
 def _spec_keys(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, bool]]:
     """(dotted key, whether it is a section) of every field of a spec."""
     for name, field in model.model_fields.items():

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from ssmail.errors import InputError
 from ssmail.execution.local import Resume
-from ssmail.experiments import ablation, ablation_specs, load_experiments
+from ssmail.experiments import ablation, ablation_specs
+from ssmail.experiments_file import load_experiments
 from ssmail.store import Store
 from ssmail_cli.ablate import parse_values
 from ssmail_cli.progress import FEW

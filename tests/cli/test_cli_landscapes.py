@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import build_spec, figure_requirements, load_experiments
+from ssmail.experiments import build_spec, figure_requirements
+from ssmail.experiments_file import load_experiments
 from ssmail.figures import FIGURES
 from ssmail.store import RunState, Store
 from tests.cli.command_line import CommandLine

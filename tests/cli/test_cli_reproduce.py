@@ -25,7 +25,7 @@ def plan(outcome: Outcome) -> dict[str, tuple[int, int, int]]:
 
 def needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, **figures: list[str]) -> None:
     """Let figures need the runs of these methods alone, so that they can be drawn from little."""
-    from ssmail.experiments import load_experiments
+    from ssmail.experiments_file import load_experiments
 
     head = load_experiments().path.read_text().partition("\nfigures:\n")[0]
     entries = [f"  {name}: {{environment: yjunction, methods: {methods}}}" for name, methods in figures.items()]

@@ -11,7 +11,7 @@ from ssmail.errors import InputError
 from ssmail.evaluation.claims.verdicts import Part, Verdict
 from ssmail.evidence import Judgement, judge
 from ssmail.evidence.collectors import COLLECTORS
-from ssmail.experiments import load_experiments
+from ssmail.experiments_file import load_experiments
 from ssmail.store import Store
 
 from .scenarios import SCENARIOS

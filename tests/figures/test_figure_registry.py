@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import load_experiments
+from ssmail.experiments_file import load_experiments
 from ssmail.figures import FIGURES, style
 
 

@@ -7,7 +7,7 @@ from ssmail.errors import InputError
 from ssmail.evaluation.claims.verdicts import Claim, Decision, Verdict, holm
 from ssmail.evidence.collectors import COLLECTORS
 from ssmail.evidence.runs import EMPTY, Runs
-from ssmail.experiments import unknown_name
+from ssmail.spec_keys import unknown_name
 from ssmail.store import Store
 
 FEW = 5  # seeds that a claim without runs is given to begin with

@@ -12,9 +12,10 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from ssmail.errors import InputError
-from ssmail.experiments import Ablation, ablation, ablation_specs, as_written, figure_requirements, frozen, leaves
+from ssmail.experiments import Ablation, ablation, ablation_specs, as_written, figure_requirements, frozen
 from ssmail.figures import NoRuns
 from ssmail.figures.selection import SETTLED, Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
+from ssmail.spec_keys import leaves
 from ssmail.store import RunRow, Store
 
 _ABSENT = object()

@@ -24,9 +24,9 @@ from ssmail.data import expert_file
 from ssmail.data.mocap.dataset import SPLITS
 from ssmail.data.trajectories import ExpertSet, Trajectories
 from ssmail.errors import InputError
-from ssmail.experiments import unknown_name
 from ssmail.figures import style
 from ssmail.figures.provenance import Provenance
+from ssmail.spec_keys import unknown_name
 
 NAME = "skeleton"
 RATE = 120  # frames per second of the recordings

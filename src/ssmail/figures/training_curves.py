@@ -20,12 +20,12 @@ from matplotlib.lines import Line2D
 
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
-from ssmail.experiments import leaves, unknown_name
 from ssmail.figures import curve_notes, curves, style
 from ssmail.figures.curves import Band, band, silent
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.quantities import label, last_part
 from ssmail.figures.selection import Group, Selection, by_spec, newest_of_each_seed, on_one_data_set
+from ssmail.spec_keys import leaves, unknown_name
 from ssmail.store import RunRow, Store
 
 NAME = "training"
