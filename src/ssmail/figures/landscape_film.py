@@ -121,7 +121,7 @@ def _draw(record: LandscapeRecord, landscape: Landscape, limits: tuple[float, fl
     columns = min(agents, 2)
     rows = -(-agents // columns)
     tall = planes.height(landscape, 2.9 / columns)
-    figure = style.new_figure(height=1.1 + rows * (tall + 0.2))
+    figure = style.new_figure(height=0.95 + rows * (tall + 0.15))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes in grid[agents:]:
         axes.set_axis_off()
