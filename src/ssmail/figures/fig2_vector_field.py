@@ -215,13 +215,14 @@ def draw(record: VectorFieldRecord) -> Figure:
     rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)
     tall = float(np.clip(2.9 / columns * (top - bottom) / (right - left), 0.6, 3.0))
     with style.sheet():
-        figure = style.new_figure(height=0.75 + rows * (tall + 0.2))
+        figure = style.new_figure(height=0.9 + rows * (tall + 0.2))
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, field in zip(panels, record.fields, strict=True):
             _draw_field(axes, field, record.spacing)
             axes.set(xlim=frame[:2], ylim=frame[2:])
             axes.set_aspect("equal")
             axes.grid(False)
+        planes.label_axes(list(panels), columns, record.fields[0].run.environment)
         kinds = {"current trajectory": planes.POLICY, "expert": planes.EXPERT}
         handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
         marks = {"slope towards the expert": TOWARDS, "away from it": AWAY}
