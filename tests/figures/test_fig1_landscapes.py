@@ -87,8 +87,8 @@ def test_it_is_drawn_with_one_scale_for_all_colours(store: Store, both: dict[str
     assert [title for title in titles if title] == [
         "(a) task",
         "(b) ideal reward",
-        "(c) gail, seed 2",
-        "(d) ssail, seed 2",
+        "(c) gail, seed 2, epoch 3",
+        "(d) ssail, seed 2, epoch 3",
     ]
 
 

@@ -48,7 +48,7 @@ def test_arrows_stand_on_tau_alpha_and_their_cosines_are_those_of_the_field(
     np.testing.assert_allclose(field.cosine[8:], 1.0, atol=1e-6)
     table = record.table()
     arrows = table[(table["kind"] == "arrow") & (table["seed"] == 0)]
-    assert arrows["alpha"].nunique() == 8
+    assert arrows["alpha"].nunique() == 16
     assert np.allclose(arrows["cosine"], np.where(arrows["alpha"] < 0, -0.6, 1.0), atol=1e-3)
     numbers = table[table["kind"] == "number"]
     assert sorted(numbers["behind_cosine"]) == sorted([*COSINES["[0,1]"], *COSINES["[-1,1]"]])
@@ -63,9 +63,9 @@ def test_colours_tell_towards_from_away(store: Store, runs: dict[str, list[str]]
         {to_hex(artist.get_facecolor()[0]): artist.N for artist in axes.get_children() if isinstance(artist, Quiver)}
         for axes in figure.axes
     ]
-    shown = 2 * 8 * 2  # trajectories, steps and agents, for each alpha; at 0.75 it is less than a grid cell to go
-    assert arrows[0] == {AWAY.lower(): 4 * shown, TOWARDS.lower(): 3 * shown}
-    assert arrows[1] == {TOWARDS.lower(): 7 * shown}
+    shown = 4 * 2  # steps and agents, for each alpha; from 0.75 on it is less than a grid cell to go
+    assert arrows[0] == {AWAY.lower(): 8 * shown, TOWARDS.lower(): 6 * shown}
+    assert arrows[1] == {TOWARDS.lower(): 14 * shown}
 
 
 def test_a_run_without_a_field(store: Store, add_landscapes: AddRun, runs: dict[str, list[str]]) -> None:
@@ -83,3 +83,14 @@ def test_a_run_without_a_field(store: Store, add_landscapes: AddRun, runs: dict[
 def test_nothing_stored_names_the_command(store: Store) -> None:
     with pytest.raises(NoRuns, match="ssmail ablate alpha --env"):
         FIGURES["vector-field"].collect(store)
+
+
+def test_the_range_of_figure_1_is_left_out_unless_it_is_asked_for(
+    store: Store, add_landscapes: AddRun, runs: dict[str, list[str]]
+) -> None:
+    other = add_landscapes(behind=0.9)
+    record = collect(store)
+    assert [field.label for field in record.fields] == ["[0, 1]", "[-1, 1]"]
+    assert any("left out, for the figure compares [0, 1] and [-1, 1]: [-1, 1.5]." in note for note in record.notes)
+    asked = collect(store, [other, *runs["[0,1]"]])
+    assert [field.label for field in asked.fields] == ["[0, 1]", "[-1, 1.5]"]

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from ssmail.data.trajectories import Floats
 
-CELLS = 40  # of the grid along the longer side of the plane
+CELLS = 36  # of the grid along the longer side of the plane
 MARGIN = 0.15  # of the plane around the expert's bounding box, as a share of the box's longer side
 USABLE = 0.25  # a slope is usable from this fraction of the even slope on
 NEAR = 0.1  # expert states that are nearer than this have about the same weight

@@ -183,7 +183,7 @@ def draw(record: LandscapesRecord) -> Figure:
     panels = 2 + len(record.shown)
     rows = (panels + 1) // 2
     with style.sheet():
-        figure = style.new_figure(height=0.75 + rows * (planes.height(record.landscape, 1.45) + 0.2))
+        figure = style.new_figure(height=0.9 + rows * (planes.height(record.landscape, 1.45) + 0.2))
         grid = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False).ravel()
         for axes in grid[panels:]:
             axes.set_axis_off()
@@ -192,7 +192,8 @@ def draw(record: LandscapesRecord) -> Figure:
         _title(grid[1], 1, "ideal reward")
         for place, item in enumerate(record.shown, start=2):
             images.append(planes.draw_reward(grid[place], item.landscape, item.reward))
-            _title(grid[place], place, f"{item.label}, seed {item.run.seed}")
+            _title(grid[place], place, f"{item.label}, seed {item.run.seed}, epoch {item.landscape.epoch}")
+        planes.label_axes(list(grid[:panels]), 2, record.shown[0].run.environment)
         for axes in grid[1:panels]:
             planes.draw_paths(axes, record.landscape.expert[:4], planes.EXPERT, lw=0.5)
         bar = figure.colorbar(images[0], ax=list(grid), location="bottom", aspect=40, fraction=0.04, pad=0.02)

@@ -2,8 +2,8 @@
 for the ranges that alpha is drawn from.
 
 An arrow stands at the position of tau_alpha = (1 - alpha) tau_G + alpha tau_E at some steps, for alpha from -1 to
-below 1. tau_G are rollouts of the policy after a tenth of the epochs, when it is still away from the expert; tau_E is
-for each of them the nearest training trajectory. The arrow has the direction of the gradient of an agent's reward with
+below 1. tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is for
+each of them the nearest training trajectory. The arrow has the direction of the gradient of an agent's reward with
 respect to its own position, at the state and the action of tau_alpha; its colour tells whether that is towards the
 position of tau_E at the same step (by less than a right angle) or away. Where nothing is left to go there is no arrow.
 
@@ -24,20 +24,20 @@ from matplotlib.lines import Line2D
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import cosines
+from ssmail.experiments import ablation, as_written, figure_requirements
 from ssmail.figures import planes, style
 from ssmail.figures.ablation_selection import select_ablation
-from ssmail.figures.planes import Landscape
 from ssmail.figures.provenance import Provenance
 from ssmail.figures.selection import Selection
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
-STEPS = 8  # of a trajectory, at which arrows stand
-ALPHAS = 8  # that have arrows
-TRAJECTORIES = 2
+STEPS = 10  # of a trajectory, at which arrows stand
+TRAJECTORIES = 1
+MARGIN = 0.3  # around current trajectory and expert, as a share of the longer side
 TOWARDS, AWAY = "#009E73", "#CC79A7"
-ARROW = 0.035  # length, as a share of the frame's width
+ARROW = 0.03  # length, as a share of the frame's width
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +79,19 @@ class VectorFieldRecord:
 
     fields: tuple[Field, ...]  # one for each range
     measured: tuple[Measured, ...]
-    landscape: Landscape  # of the first, for the frame
+    spacing: float  # of the plane's grid: what is nearer to the expert than this has no arrow
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top of all that is shown but for the arrows, with a margin."""
+        paths = [getattr(field, kind)[:TRAJECTORIES] for field in self.fields for kind in ("current", "expert")]
+        points = np.concatenate([path.reshape(-1, 2) for path in paths])
+        points = points[np.isfinite(points).all(axis=1)]
+        (left, bottom), (right, top) = points.min(axis=0), points.max(axis=0)
+        margin = MARGIN * max(right - left, top - bottom)
+        return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, behind_cosine, ahead_cosine, epoch, alpha, trajectory, agent, step, x, y,
@@ -105,6 +115,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without a vector field.
     """
     selection = select_ablation(store, NAME, runs, profile)
+    selection = selection if runs else _of_the_paper(selection)
     measured = _measured(store, selection)
     chosen = [median_of([one for one in measured if one.label == group.label]) for group in selection.groups]
     fields = tuple(_field(store, one) for one in chosen)
@@ -112,10 +123,22 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     return VectorFieldRecord(
         fields=fields,
         measured=measured,
-        landscape=planes.read(store, first, planes.stored_epochs(store, first)[0]),
+        spacing=planes.read(store, first, planes.stored_epochs(store, first)[0]).plane.spacing,
         provenance=Provenance.of(NAME, selection.runs),
         notes=(*selection.notes, *_notes(measured, fields)),
     )
+
+
+def _of_the_paper(selection: Selection) -> Selection:
+    """Without values that the ablation of experiments.yaml does not have, such as the range of Figure 1."""
+    entry = figure_requirements(NAME)
+    values = ablation(str(entry.ablation), entry.environment).values
+    groups = tuple(group for group in selection.groups if group.value in values)
+    others = [group.label for group in selection.groups if group.value not in values]
+    if not groups or not others:
+        return selection
+    note = f"left out, for the figure compares {' and '.join(map(str, map(as_written, values)))}: {', '.join(others)}."
+    return Selection(groups, (*selection.notes, note))
 
 
 def median_of(measured: Sequence[Measured]) -> Measured:
@@ -164,8 +187,8 @@ def _notes(measured: Sequence[Measured], fields: Sequence[Field]) -> list[str]:
 
 def _arrows(field: Field) -> tuple[np.ndarray, ...]:
     """Indices (A', R', T') of the points that have arrows."""
-    alphas = np.arange(0, len(field.alpha), max(len(field.alpha) // ALPHAS, 1))
-    steps = np.linspace(0, field.current.shape[1] - 1, STEPS + 1).round().astype(int)[1:]
+    alphas = np.arange(len(field.alpha))
+    steps = np.unique(np.linspace(0, field.current.shape[1] - 1, STEPS).round().astype(int))
     return np.ix_(alphas, np.arange(min(TRAJECTORIES, len(field.current))), steps)
 
 
@@ -184,13 +207,22 @@ def _field_rows(field: Field) -> list[pd.DataFrame]:
 
 
 def draw(record: VectorFieldRecord) -> Figure:
-    """A panel for each range, side by side or one above the other, whichever fits; the legend above."""
+    """A panel for each range, all of one frame, side by side where it is tall and else below one another; the legend
+    stands above.
+    """
+    left, right, bottom, top = frame = record.frame
+    beside = top - bottom > 0.8 * (right - left)
+    rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)
+    tall = float(np.clip(2.9 / columns * (top - bottom) / (right - left), 0.6, 3.0))
     with style.sheet():
-        tall = planes.height(record.landscape, 1.5, ceiling=3.0)
-        figure = style.new_figure(height=0.85 + tall)
-        panels = figure.subplots(1, len(record.fields), sharex=True, sharey=True, squeeze=False)[0]
+        figure = style.new_figure(height=0.9 + rows * (tall + 0.2))
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for axes, field in zip(panels, record.fields, strict=True):
-            _draw_field(axes, field, record.landscape)
+            _draw_field(axes, field, record.spacing)
+            axes.set(xlim=frame[:2], ylim=frame[2:])
+            axes.set_aspect("equal")
+            axes.grid(False)
+        planes.label_axes(list(panels), columns, record.fields[0].run.environment)
         kinds = {"current trajectory": planes.POLICY, "expert": planes.EXPERT}
         handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
         marks = {"slope towards the expert": TOWARDS, "away from it": AWAY}
@@ -202,7 +234,7 @@ def draw(record: VectorFieldRecord) -> Figure:
         return figure
 
 
-def _draw_field(axes: Axes, field: Field, landscape: Landscape) -> None:
+def _draw_field(axes: Axes, field: Field, spacing: float) -> None:
     shown = slice(TRAJECTORIES)
     planes.draw_paths(axes, field.expert[shown], planes.EXPERT, lw=1.0)
     planes.draw_paths(axes, field.current[shown], planes.POLICY, lw=1.0)
@@ -210,7 +242,7 @@ def _draw_field(axes: Axes, field: Field, landscape: Landscape) -> None:
     found = (field.places, field.gradient, field.cosine)
     places, gradient, cosine = (values[at].reshape(-1, *values.shape[4:]) for values in found)
     lengths = np.linalg.norm(gradient, axis=-1, keepdims=True)
-    far = np.linalg.norm(field.expert - field.places, axis=-1)[at].ravel() > landscape.plane.spacing
+    far = np.linalg.norm(field.expert - field.places, axis=-1)[at].ravel() >= spacing
     arrows = gradient / np.maximum(lengths, 1e-12)
     for towards, colour in ((True, TOWARDS), (False, AWAY)):
         use = far & ((cosine > 0) == towards) & (lengths[:, 0] > 0)
@@ -227,5 +259,4 @@ def _draw_field(axes: Axes, field: Field, landscape: Landscape) -> None:
             pivot="tail",
             zorder=3,
         )
-    planes.frame(axes, landscape)
     axes.set_title(rf"$\alpha$ in {field.label}, seed {field.run.seed}", fontsize=7, pad=2)

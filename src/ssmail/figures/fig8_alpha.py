@@ -5,7 +5,7 @@ that are drawn from another range, which vary by 1/12 for [0, 1] and by 1/3 for 
 of them loses by that much more. Both panels show what is the same quantity whatever alpha is drawn from:
 
 - above, the error of the policy on training trajectories, free-running and sampled: `train/mse`, over all predicted
-  steps and six features, on mocap (on Y-Junction `train/mode_mse`, to the nearer lane), squared scaled units;
+  steps and features, on mocap and letters (on Y-Junction `train/mode_mse`, to the nearer lane), squared scaled units;
 - below, the discriminator's loss on tau_G and tau_E, the first two terms of Eq. 3 without the self-supervised one:
   `discriminator/generated` + `discriminator/expert`. It is 1/2 for a D that says 1/2 of everything and 0 for one that
   tells the two apart for certain. D is trained on all three terms, so what it makes of these two depends on the range.
@@ -36,7 +36,11 @@ from ssmail.figures.selection import Selection
 from ssmail.store import Store
 
 NAME = "fig8"
-ERRORS = {"mocap": "mse", "yjunction": "mode_mse"}  # by environment: the error that tells how well a policy does
+ERRORS = {
+    "mocap": "mse",
+    "letters": "mse",
+    "yjunction": "mode_mse",
+}  # by environment: the error that tells how well a policy does
 TERMS = ("discriminator/generated", "discriminator/expert")
 LOSS = " + ".join(TERMS)
 UNDECIDED = 0.5  # the loss of a D that says 1/2 of everything

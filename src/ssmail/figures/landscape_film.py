@@ -121,7 +121,7 @@ def _draw(record: LandscapeRecord, landscape: Landscape, limits: tuple[float, fl
     columns = min(agents, 2)
     rows = -(-agents // columns)
     tall = planes.height(landscape, 2.9 / columns)
-    figure = style.new_figure(height=1.1 + rows * (tall + 0.2))
+    figure = style.new_figure(height=1.05 + rows * (tall + 0.15))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     for axes in grid[agents:]:
         axes.set_axis_off()
@@ -131,6 +131,7 @@ def _draw(record: LandscapeRecord, landscape: Landscape, limits: tuple[float, fl
         planes.draw_paths(axes, landscape.rollouts[:4, :, [agent]], "white", lw=1.3)
         planes.draw_paths(axes, landscape.rollouts[:4, :, [agent]], planes.POLICY, lw=0.7)
         axes.set_title(f"agent {agent}", fontsize=7, pad=2)
+    planes.label_axes(list(grid[:agents]), columns, record.run.environment)
     bar = figure.colorbar(image, ax=list(grid), location="bottom", aspect=40, fraction=0.04, pad=0.02)
     bar.set_label("reward", fontsize=7)
     _draw_legend(figure, record, landscape)

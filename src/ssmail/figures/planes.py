@@ -17,6 +17,7 @@ from ssmail.store import RunRow, Store
 
 MAP = "viridis"
 EXPERT, POLICY = "#D55E00", "#0072B2"  # red and blue of Okabe and Ito, as in the paper's figure
+UNITS = {"letters": "letter heights", "yjunction": "step lengths"}  # by environment, of raw lengths
 LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, of a reward from 0 to 1
 
 
@@ -113,6 +114,17 @@ def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[
         axes.contour(landscape.x, landscape.y, reward, levels=levels, colors="white", linewidths=0.3, alpha=0.7)
     frame(axes, landscape)
     return image
+
+
+def label_axes(grid: Sequence[Axes], columns: int, environment: str) -> None:
+    """Say what is on the axes, in the panels of the left column and of the lowest row, which come row by row."""
+    unit = f" ({UNITS[environment]})" if environment in UNITS else ""
+    for place, axes in enumerate(grid):
+        if place % columns == 0:
+            axes.set_ylabel(f"y{unit}", fontsize=7)
+        if place + columns >= len(grid):
+            axes.set_xlabel(f"x{unit}", fontsize=7)
+            axes.tick_params(labelbottom=True)
 
 
 def frame(axes: Axes, landscape: Landscape) -> None:

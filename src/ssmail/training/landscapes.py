@@ -21,7 +21,7 @@ REFERENCES = 2  # training trajectories whose states stand in for what a point o
 STATES = 24  # of a reference, evenly over its steps
 SHOWN = 16  # training trajectories that pictures show
 ROLLOUTS = 8  # current trajectories, from the starts of the first of the references
-CURRENT = 0.1  # the fraction of the epochs after which the policy is "the current one" of Figure 2
+CURRENT = 0.5  # the fraction of the epochs after which the policy is "the current one" of Figure 2
 BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # alphas of the points behind the current trajectory
 AHEAD = tuple(a / 8 for a in range(8))  # and of those on it and before it
 
