@@ -1,6 +1,6 @@
 """What figures need of a database: found by collecting each of them from a store that remembers what is read."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -55,8 +55,11 @@ class Needs:
     undrawable: Mapping[str, str]
 
 
-def needs(store: Store, runs: Sequence[RunRow]) -> Needs:
-    """What every figure reads, were these runs the only ones: of each profile and, where it can, each environment."""
+def needs(store: Store, runs: Sequence[RunRow], readers: Sequence[Callable[[Store], object]] = ()) -> Needs:
+    """What every figure reads, were these runs the only ones: of each profile and, where it can, each environment.
+
+    `readers` are called with the same store, for what they read to be wanted too (whole); what they give is dropped.
+    """
     recorder = RecordingStore.open(store.url)
     recorder.show([run.id for run in runs])
     undrawable = {}
@@ -65,6 +68,9 @@ def needs(store: Store, runs: Sequence[RunRow]) -> Needs:
             recorder.thinnings = module.thinnings()
             if reason := _read(module, recorder, runs):
                 undrawable[module.name] = reason
+        recorder.thinnings = {}
+        for reader in readers:
+            reader(recorder)
     finally:
         recorder.close()
     return Needs(Wanted(frozenset(recorder.curves), recorder.arrays), undrawable)
