@@ -67,7 +67,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 
 @app.command()
 def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
-    """Look for problems, in the database and in the checkpoints beside it.
+    """Look for problems in the database and its checkpoints.
 
     Prints one line for each, with its remedy, and changes nothing. Exit code 0: none, 1: some. It reads the whole file
     and all checkpoints, and may be used while runs are being computed.
@@ -140,7 +140,7 @@ def export(
     as_json: Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Write a small database of runs that ended, from which the figures can be drawn.
+    """Write a small database that draws all figures.
 
     The newest finished or diverged run of each spec and seed, with the last value of every metric, the curves and
     arrays that figures show, and no checkpoints. What is left out is told.
