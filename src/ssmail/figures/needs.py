@@ -14,7 +14,9 @@ from ssmail.store.compact import Thinning, Wanted
 if TYPE_CHECKING:
     import pandas as pd
 
-USUAL_CURVES = ("train/mode_mse", "validation/mode_mse", "train/mse", "validation/mse")
+USUAL_CURVES = tuple(
+    f"{split}/{error}" for split in ("train", "validation") for error in ("mode_mse", "mse", "stroke_distance")
+)
 """The errors of every epoch: kept for all runs, whether or not a figure reads them."""
 
 
