@@ -13,7 +13,16 @@ from ssmail import spec as specs
 from ssmail.errors import InputError
 from ssmail.experiments import build_spec
 from ssmail.shaping import read_label
-from ssmail.spec import ENVIRONMENT_SECTIONS, ENVIRONMENTS, METHODS, OPTIONAL_SECTIONS, SECTIONS, RunSpec, sections_of
+from ssmail.spec import (
+    ENVIRONMENT_SECTIONS,
+    ENVIRONMENTS,
+    METHODS,
+    OPTIONAL_SECTIONS,
+    SECTIONS,
+    RunSpec,
+    hash_of,
+    sections_of,
+)
 
 NO_DATA = {"path": None, "yjunction": None, "letters": None}
 
@@ -184,3 +193,14 @@ def test_alpha_is_a_range_or_weighted_ranges(given: str, density: object, pieces
     again = RunSpec.model_validate_json(made.as_json())
     assert again == made
     assert again.hash() == made.hash() != build_spec("ssail", "yjunction", "smoke").hash()
+
+
+def test_the_hash_of_stored_values_is_that_of_the_spec() -> None:
+    for method, environment in (("ssail", "yjunction"), ("dnri", "mocap"), ("gail", "letters")):
+        spec = build_spec(method, environment, "smoke")
+        stored = json.loads(spec.as_json())
+        assert hash_of(stored) == spec.hash()
+        older = {**stored, "data": {key: value for key, value in stored["data"].items() if key != "letters"}}
+        assert (hash_of(older) == spec.hash()) is (environment != "letters")
+        stored["evaluation"]["samples"] += 1
+        assert hash_of(stored) != spec.hash()

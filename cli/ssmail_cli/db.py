@@ -67,7 +67,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 
 @app.command()
 def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
-    """Look for problems, in the database and in the checkpoints beside it.
+    """Look for problems in the database and its checkpoints.
 
     Prints one line for each, with its remedy, and changes nothing. Exit code 0: none, 1: some. It reads the whole file
     and all checkpoints, and may be used while runs are being computed.
@@ -131,7 +131,7 @@ def merge(
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write; it must not exist.")],
     compact: Annotated[
-        bool, typer.Option("--compact", help="Only what figures need. (For a whole copy: ssmail db backup.)")
+        bool, typer.Option("--compact", help="Only what figures and claims need. (For a whole copy: ssmail db backup.)")
     ] = False,
     method: options.Method = None,
     environment: options.Environment = None,
@@ -140,25 +140,31 @@ def export(
     as_json: Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Write a small database of runs that ended, from which the figures can be drawn.
+    """Write a small database that draws all figures and judges all claims.
 
     The newest finished or diverged run of each spec and seed, with the last value of every metric, the curves and
-    arrays that figures show, and no checkpoints. What is left out is told.
+    arrays that figures and claims read, and no checkpoints. What is left out is told.
     """
+    from functools import partial
+
+    from ssmail.evidence import judge
     from ssmail.figures.needs import needs
     from ssmail.store import Store
     from ssmail.store.compact import export_compact, settled_cells
     from ssmail.store.sqlite_file import existing, require_current
 
     if not compact:
-        raise InputError("give --compact to export what figures need; `ssmail db backup FILE` copies everything.")
+        raise InputError(
+            "give --compact to export what figures and claims need; `ssmail db backup FILE` copies everything."
+        )
     require_current(existing(db))
     store = Store.open(db)
     matching = options.select_runs(store, None, method, environment, profile, None, figure)
     runs = settled_cells(matching)
     if not runs:
         raise InputError(f"no finished or diverged run in {db} meets these conditions; `ssmail runs list` shows all.")
-    needed = needs(store, runs)
+    claims = [partial(judge, profile=name) for name in (None, *{run.profile: None for run in runs})]
+    needed = needs(store, runs, claims)
     done = export_compact(db, file, runs, needed.wanted)
     others = len(store.runs()) - len(runs)
     if as_json:

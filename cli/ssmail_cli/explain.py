@@ -74,7 +74,8 @@ def _verdict(agreement: "Agreement | None", db: str) -> str:
         return f"there is no database {db} to compare with; name one with --db"
     changed = sum(state not in ("same", "missing") for state in agreement.runs.values())
     missing = sum(state == "missing" for state in agreement.runs.values())
-    parts = [f"{missing} runs are missing"] * bool(missing) + [f"{changed} runs have changed"] * bool(changed)
+    of = f"of {len(agreement.runs)} runs"
+    parts = [f"{missing} {of} missing"] * bool(missing) + [f"{changed} {of} changed"] * bool(changed)
     if agreement.agrees:
         return f"{agreement.where} agrees: all runs are there, and give the same values"
     if agreement.values == "different":

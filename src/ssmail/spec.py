@@ -318,11 +318,7 @@ class RunSpec(Frozen):
         the seed. A section that is added for other methods thus leaves the hash as it was, and so does a key of LATER
         with the value that earlier runs had.
         """
-        values = self.model_dump(mode="json", exclude_none=True)
-        for section, key, before in LATER:
-            if section in values and values[section].get(key) == before:
-                values[section].pop(key, None)
-        return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
+        return hash_of(self.model_dump(mode="json"))
 
     @classmethod
     def from_mapping(cls, values: dict[str, Any]) -> Self:
@@ -333,6 +329,15 @@ class RunSpec(Frozen):
 def sections_of(method: str, environment: str) -> tuple[str, ...]:
     """The sections of a spec that are not null, beside data and evaluation."""
     return (*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
+
+
+def hash_of(stored: Mapping[str, Any]) -> str:
+    """RunSpec.hash of a spec's nested values, as they are stored as JSON; of an earlier version's too."""
+    values = _without_nulls(stored)
+    for section, key, before in LATER:
+        if section in values and values[section].get(key) == before:
+            values[section].pop(key, None)
+    return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
 
 
 def completed(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -346,6 +351,14 @@ def completed(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _needs(needed: bool) -> str:
     return "needs" if needed else "has no"
+
+
+def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        key: _without_nulls(value) if isinstance(value, Mapping) else value
+        for key, value in values.items()
+        if value is not None
+    }
 
 
 def _canonical(values: Any) -> str:

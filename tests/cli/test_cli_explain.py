@@ -48,7 +48,7 @@ def test_a_database_that_does_not_agree(cli: CommandLine, drawn: Path, db: Path,
     assert f"{db} does not agree: the values differ: line " in told.err
     Store.open(tmp_path / "empty.db").close()
     told = cli("explain", drawn, "--db", tmp_path / "empty.db")
-    assert (told.code, "does not agree: 2 runs are missing" in told.err) == (1, True)
+    assert (told.code, "does not agree: 2 of 2 runs missing" in told.err) == (1, True)
 
 
 def test_without_a_database_the_figure_tells_what_it_knows(cli: CommandLine, drawn: Path, tmp_path: Path) -> None:

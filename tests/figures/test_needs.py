@@ -107,3 +107,17 @@ def test_figures_that_cannot_be_drawn_are_told(store: Store, add_run: Any) -> No
     assert {"fig3", "fig7", "fig8"} <= set(undrawable)
     assert not {"fig4", "fig5", "fig9"} & set(undrawable)
     assert undrawable["fig7"].startswith("fig7 has nothing to draw")
+
+
+def test_what_other_readers_need_is_kept_too_and_whole(filled: Store) -> None:
+    runs = settled_cells(filled.runs())
+    shown = next(run for run, names in needs(filled, runs).wanted.arrays.items() if "test/rollouts" in names)
+
+    def read(store: Store) -> None:
+        store.metrics([shown], ["actor/loss"])
+        store.array(shown, "test/rollouts")
+
+    wanted = needs(filled, runs, [read]).wanted
+    assert "actor/loss" in wanted.curves
+    assert wanted.arrays[shown]["test/rollouts"] is None
+    assert wanted.arrays[shown]["test/lanes"] is not None

@@ -1,6 +1,6 @@
 """What figures need of a database: found by collecting each of them from a store that remembers what is read."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +14,9 @@ from ssmail.store.compact import Thinning, Wanted
 if TYPE_CHECKING:
     import pandas as pd
 
-USUAL_CURVES = ("train/mode_mse", "validation/mode_mse", "train/mse", "validation/mse")
+USUAL_CURVES = tuple(
+    f"{split}/{error}" for split in ("train", "validation") for error in ("mode_mse", "mse", "stroke_distance")
+)
 """The errors of every epoch: kept for all runs, whether or not a figure reads them."""
 
 
@@ -55,8 +57,11 @@ class Needs:
     undrawable: Mapping[str, str]
 
 
-def needs(store: Store, runs: Sequence[RunRow]) -> Needs:
-    """What every figure reads, were these runs the only ones: of each profile and, where it can, each environment."""
+def needs(store: Store, runs: Sequence[RunRow], readers: Sequence[Callable[[Store], object]] = ()) -> Needs:
+    """What every figure reads, were these runs the only ones: of each profile and, where it can, each environment.
+
+    `readers` are called with the same store, for what they read to be wanted too (whole); what they give is dropped.
+    """
     recorder = RecordingStore.open(store.url)
     recorder.show([run.id for run in runs])
     undrawable = {}
@@ -65,6 +70,9 @@ def needs(store: Store, runs: Sequence[RunRow]) -> Needs:
             recorder.thinnings = module.thinnings()
             if reason := _read(module, recorder, runs):
                 undrawable[module.name] = reason
+        recorder.thinnings = {}
+        for reader in readers:
+            reader(recorder)
     finally:
         recorder.close()
     return Needs(Wanted(frozenset(recorder.curves), recorder.arrays), undrawable)

@@ -1,17 +1,15 @@
 """What is wrong with a database and the checkpoints beside it, each problem with its remedy. Nothing is changed."""
 
-import hashlib
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import DBAPIError
 
 from ssmail.errors import InputError
+from ssmail.spec import hash_of
 from ssmail.store import arrays, lifecycle, queries, schema
 from ssmail.store.checkpoint_files import STAGING, fault, root_of
 from ssmail.store.connection import revision_of
@@ -91,13 +89,12 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
 
 
 def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
-    """The hash must be that of the spec; see RunSpec.hash."""
+    """The hash must be that of the spec."""
     try:
-        known = _without_nulls(run.spec)
-    except ValueError:
-        known = None
-    canonical = json.dumps(known, sort_keys=True, separators=(",", ":"))
-    if hashlib.sha256(canonical.encode()).hexdigest()[:16] != run.spec_hash:
+        found = hash_of(run.spec)
+    except (ValueError, TypeError, AttributeError):  # no JSON, or not that of a spec
+        found = None
+    if found != run.spec_hash:
         yield Problem("spec", run.id, f"the spec of run {run.name} does not have the hash {run.spec_hash}", _again(run))
 
 
@@ -195,9 +192,3 @@ def _run_ids(path: Path) -> set[str]:
 
 def _again(run: RunRow) -> str:
     return f"delete the run (`ssmail runs delete {run.name}`) and train it again"
-
-
-def _without_nulls(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nulls(item) for key, item in value.items() if item is not None}
-    return value
