@@ -1,5 +1,6 @@
 """`ssmail claims`: what the stored runs say of each claim of the paper."""
 
+import math
 import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 SUMMARY = {
     "claim": "claim",
     "alias": "",
+    "profile": "runs of",
     "verdict": "verdict",
     "p": "p",
     "corrected": "of all eight (Holm)",
@@ -24,6 +26,10 @@ SUMMARY = {
     "more_seeds": "more seeds",
 }
 WIDEST = 120  # columns of text
+LEGEND = (
+    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the columns behind it all eight "
+    "claims; docs/claims.md has the tests and bars."
+)
 
 
 def claims(
@@ -46,8 +52,8 @@ def claims(
 ) -> None:
     """Judge the paper's claims C1 to C8 by the stored runs: supported, contradicted or inconclusive.
 
-    Each part of a claim has a statistic and an exact test, defined beforehand (docs/claims.md), at 0.05 for each claim;
-    the last columns correct for all eight. Every seed counts. CSV has a row for each part, JSON everything.
+    Each part of a claim has a statistic and an exact test, defined beforehand (docs/claims.md), at 0.05; Holm's
+    correction for all eight claims stands beside it. Every seed counts. CSV has a row for each part, JSON everything.
     """
     from ssmail.evidence import judge
 
@@ -67,6 +73,7 @@ def claims(
     for found in judgements:
         typer.echo("\n".join([*_told(found), ""]))
     print_table([_summary(found) for found in judgements], SUMMARY)
+    typer.echo("\n".join(_wrapped(LEGEND, 0)))
 
 
 _PART_COLUMNS = (
@@ -78,15 +85,16 @@ _PART_COLUMNS = (
 def _summary(found: "Judgement") -> dict[str, Any]:
     """A claim as a row."""
     decision = found.decision
-    more = "no number" if decision.more_seeds is None else decision.more_seeds
+    unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
         "claim": found.claim.name,
         "alias": found.claim.alias,
+        "profile": found.profile,
         "verdict": found.verdict.value,
         "p": decision.p,
         "corrected": found.corrected.value,
         "p_holm": found.p_holm,
-        "more_seeds": "no runs" if not found.runs else more,
+        "more_seeds": unsettled if decision.more_seeds is None else decision.more_seeds,
     }
 
 
@@ -184,7 +192,7 @@ def _need(part: "Part") -> str:
 def _seeds(sample: "Sample") -> str:
     """Every seed's value."""
     values: Sequence[tuple[int, float]] = list(zip(sample.seeds, sample.values, strict=True))
-    told = ", ".join(f"{seed}: {short(value, 3)}" for seed, value in values)
+    told = ", ".join(f"{seed}: {'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in values)
     return f"{sample.label}, seed by seed: {told or 'no runs'}"
 
 

@@ -65,6 +65,7 @@ def test_the_text_tells_the_verdict_every_seed_and_what_is_missing(cli: CommandL
     assert "C3 beta (section 4.5, fig6): supported" in text
     assert "beta 0.15, seed by seed: 0: 0.002, 1: 0.0021, 2: 0.0022, 3: 0.0023, 4: 0.0024" in text
     assert "gail does not converge: inconclusive, no runs of gail" in text
+    assert "C1 stability smoke inconclusive 1 inconclusive 1 runs missing" in text
     assert "next: ssmail reproduce --only fig8 --profile quick --seeds 0-4" in text
 
 

@@ -18,7 +18,10 @@ CLAIM = Claim(
 POSITIVE, BOTH = (0.0, 1.0), (-1.0, 1.0)  # what alpha is drawn from
 TOWARDS = 0.5  # cosine: within 60 degrees
 
-COSINE = "landscape/behind_cosine: mean cosine between D's slope and the direction to the expert, at negative alpha"
+COSINE = (
+    "landscape/behind_cosine: mean cosine between D's slope and the direction to the expert at negative alpha, "
+    "early in training"
+)
 
 
 def decide(positive: Sample, both: Sample) -> tuple[Part, ...]:
