@@ -27,7 +27,7 @@ SUMMARY = {
 }
 WIDEST = 120  # columns of text
 LEGEND = (
-    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the columns behind it all eight "
+    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns all eight "
     "claims; docs/claims.md has the tests and bars."
 )
 
