@@ -4,6 +4,8 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from ssmail.evidence import Judgement, judge
 from ssmail.figures.needs import needs
 from ssmail.store import Store
@@ -35,3 +37,22 @@ def test_claims_are_judged_alike_from_an_export(store: Store, store_claim: Calla
     assert {"C1", "C6"} <= set(differ)  # negative control: those that read curves
     small.close()
     bare.close()
+
+
+def test_no_more_rollouts_are_kept_than_figure_5_shows(
+    store: Store, store_claim: Callable[..., None], tmp_path: Path
+) -> None:
+    lanes = np.zeros((2, 40, 3, 2, 2))
+    lanes[0, ..., 1], lanes[1, ..., 1] = 1.0, -1.0
+    rollouts = np.zeros((3, 40, 3, 2, 2))
+    rollouts[..., 1] = np.linspace(-1, 1, 40)[:, None, None]
+    runs = {name: list(seeds) for name, seeds in SCENARIOS["C2"]("true").items()}
+    runs["dnri"] = [{"arrays": {"test/rollouts": rollouts, "test/lanes": lanes}}] * 5
+    store_claim("C2", runs)
+    stored = store.runs()
+    export_compact(store.where, tmp_path / "small.db", stored, needs(store, stored, [judge]).wanted)
+    small = Store.open(tmp_path / "small.db")
+    run = small.runs(method="dnri")[0]
+    assert small.array(run.id, "test/rollouts").shape == (1, 16, 3, 2, 2)
+    assert judge(small, only=["C2"]) == judge(store, only=["C2"])
+    small.close()

@@ -1,7 +1,6 @@
 """Claims judged from databases: the three verdicts of each, runs that diverge or are missing, and Holm's correction."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,24 +10,14 @@ from ssmail.errors import InputError
 from ssmail.evaluation.claims.verdicts import Part, Verdict
 from ssmail.evidence import Judgement, judge
 from ssmail.evidence.collectors import COLLECTORS
+from ssmail.experiments import build_spec
 from ssmail.experiments_file import load_experiments
-from ssmail.store import Store
+from ssmail.store import RunState, Store
 
 from .scenarios import SCENARIOS
 
 StoreClaim = Callable[..., None]
 VERDICTS = {"true": Verdict.SUPPORTED, "false": Verdict.CONTRADICTED, "open": Verdict.INCONCLUSIVE}
-
-
-@pytest.fixture(autouse=True)
-def _figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures 1 and 2 in experiments.yaml, wherever it has none of them yet."""
-    if "fig1" in load_experiments().figures:
-        return
-    text = load_experiments().path.read_text()
-    text += "  fig1: {environment: yjunction, methods: [ssail, gail]}\n  fig2: {environment: mocap, ablation: alpha}\n"
-    (tmp_path / "experiments.yaml").write_text(text)
-    monkeypatch.setenv("SSMAIL_EXPERIMENTS", str(tmp_path / "experiments.yaml"))
 
 
 def judged(store: Store, claim: str) -> Judgement:
@@ -143,13 +132,11 @@ def test_a_run_without_the_number_makes_its_part_unknown(store: Store, store_cla
 
 
 def test_runs_on_different_data_are_not_compared(store: Store, store_claim: StoreClaim) -> None:
-    from ssmail.experiments import build_spec
-
     store_claim("C1", SCENARIOS["C1"]("true"))
     writer = store.start_run(build_spec("gail", "yjunction", "smoke"), 7, dataset_hash="e" * 64, device="cpu")
     writer.epoch(1, {"train/mode_mse": 0.1})
     writer.final(1, {})
-    writer.finish("finished")  # type: ignore[arg-type]
+    writer.finish(RunState.FINISHED)
     found = judged(store, "C1")
     assert found.verdict is Verdict.INCONCLUSIVE
     assert "different data" in found.notes[0]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ssmail.evaluation.claims import (
     c1_stability,
@@ -22,6 +23,7 @@ from ssmail.evaluation.claims import (
 from ssmail.evaluation.claims.curves import slope
 from ssmail.evaluation.claims.verdicts import Claim, Part, Sample
 from ssmail.evidence.runs import Floats, Runs
+from ssmail.figures.fig5_modes import shown_lanes, shown_rollouts
 from ssmail.figures.selection import Group
 from ssmail.store import RunRow
 from ssmail.store.comparison import latest_values
@@ -53,7 +55,7 @@ def modes(runs: Runs) -> tuple[Part, ...]:
     return c2_modes.decide(
         ends=runs.metric(ssail, "ssail", "test/on_lane", LEAST),
         balance=runs.metric(ssail, "ssail", "test/lane_balance", LEAST),
-        averaged=_of_arrays(runs, dnri, "dnri", ("test/rollouts", "test/lanes"), c2_modes.between, LEAST),
+        averaged=_of_arrays(runs, dnri, "dnri", ("test/rollouts", "test/lanes"), _between, LEAST),
     )
 
 
@@ -133,6 +135,11 @@ COLLECTORS = tuple(
         (c8_vector_field, vector_field),
     )
 )
+
+
+def _between(rollouts: npt.NDArray[np.floating], lanes: npt.NDArray[np.floating]) -> float:
+    """c2_modes.between of the rollouts that figure 5 shows: a compact database has no others."""
+    return c2_modes.between(shown_rollouts(rollouts), shown_lanes(lanes))
 
 
 def _remaining(runs: Runs, group: Group, label: str) -> Sample:

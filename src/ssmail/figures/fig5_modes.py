@@ -107,21 +107,21 @@ def _shown(starts: int) -> npt.NDArray[np.int64]:
 
 
 def _expert(store: Store, run: RunRow) -> Floats:
-    return _shown_lanes(store.array(run.id, "test/lanes"))
+    return shown_lanes(store.array(run.id, "test/lanes"))
 
 
-def _shown_lanes(lanes: Floats) -> Floats:
-    """(L, B, T, N, 2) -> (L, R, T, N, 2)."""
+def shown_lanes(lanes: Floats) -> Floats:
+    """Of (L, B, T, N, 2), the starts that are shown: (L, R, T, N, 2). What is shown already stays as it is."""
     return lanes[:, _shown(lanes.shape[1])]
 
 
-def _shown_rollouts(samples: Floats) -> Floats:
-    """(S, B, T, N, 2) -> (1, R, T, N, 2): the samples in turn."""
+def shown_rollouts(samples: Floats) -> Floats:
+    """Of (S, B, T, N, 2), the rollouts that are shown, the samples in turn: (1, R, T, N, 2); likewise."""
     starts = _shown(samples.shape[1])
     return samples[np.arange(len(starts)) % len(samples), starts][None]
 
 
-THINNINGS = {"test/lanes": _shown_lanes, "test/rollouts": _shown_rollouts}
+THINNINGS = {"test/lanes": shown_lanes, "test/rollouts": shown_rollouts}
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
@@ -147,7 +147,7 @@ def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
 def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
         return Panel(label, run.id, run.seed, None, np.nan, np.nan)
-    rollouts = _shown_rollouts(store.array(run.id, "test/rollouts"))[0]
+    rollouts = shown_rollouts(store.array(run.id, "test/rollouts"))[0]
     return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
 
 

@@ -60,7 +60,8 @@ class Needs:
 def needs(store: Store, runs: Sequence[RunRow], readers: Sequence[Callable[[Store], object]] = ()) -> Needs:
     """What every figure reads, were these runs the only ones: of each profile and, where it can, each environment.
 
-    `readers` are called with the same store, for what they read to be wanted too (whole); what they give is dropped.
+    `readers` are called with the same store, for what they read to be wanted too, arrays that a figure thins as thin as
+    that figure wants them; what they give is dropped.
     """
     recorder = RecordingStore.open(store.url)
     recorder.show([run.id for run in runs])
@@ -70,7 +71,7 @@ def needs(store: Store, runs: Sequence[RunRow], readers: Sequence[Callable[[Stor
             recorder.thinnings = module.thinnings()
             if reason := _read(module, recorder, runs):
                 undrawable[module.name] = reason
-        recorder.thinnings = {}
+        recorder.thinnings = {k: v for module in FIGURES.values() for k, v in module.thinnings().items()}
         for reader in readers:
             reader(recorder)
     finally:

@@ -5,8 +5,8 @@ takes one lane alone does not differentiate between the lanes either, so both ha
 """
 
 import numpy as np
+import numpy.typing as npt
 
-from ssmail.data.trajectories import Floats
 from ssmail.evaluation.claims.statements import typical
 from ssmail.evaluation.claims.verdicts import Claim, Part, Sample
 
@@ -24,12 +24,12 @@ AVERAGES = 0.5  # of the agents
 ENDS = "test/on_lane: share of agents of sampled test rollouts that end on a lane"
 BALANCE = "test/lane_balance: share of sampled test rollouts that take the rarer lane"
 BETWEEN = (
-    "share of agents of sampled test rollouts that end, along the line between the ends of the expert's two "
+    "share of agents of the test rollouts that figure 5 shows that end, along the line between the expert's two "
     "continuations of their start, nearer to its middle than to either end"
 )
 
 
-def between(rollouts: Floats, lanes: Floats) -> float:
+def between(rollouts: npt.NDArray[np.floating], lanes: npt.NDArray[np.floating]) -> float:
     """See BETWEEN. rollouts (S, B, T, N, P), lanes (2, B, T, N, P), both raw; an end that is not finite is nowhere."""
     left, right = lanes[0, :, -1].astype(np.float64), lanes[1, :, -1].astype(np.float64)  # (B, N, P)
     across = right - left
