@@ -78,8 +78,8 @@ class LandscapesRecord:
 
     @property
     def landscape(self) -> Landscape:
-        """Any of those shown, for the plane and the expert."""
-        return self.shown[0].landscape
+        """The one whose plane and expert the task and the ideal are of."""
+        return self.shown[-1].landscape
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, slope_share, cosine, threshold, trajectory, agent, step, x, y, reward].

@@ -5,7 +5,8 @@ An arrow stands at the position of tau_alpha = (1 - alpha) tau_G + alpha tau_E a
 below 1. tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is for
 each of them the nearest training trajectory. The arrow has the direction of the gradient of an agent's reward with
 respect to its own position, at the state and the action of tau_alpha; its colour tells whether that is towards the
-position of tau_E at the same step (by less than a right angle) or away. Where nothing is left to go there is no arrow.
+position of tau_E at the same step (by less than a right angle) or away. Where nothing is left to go, or
+the gradient is nil, there is no arrow.
 
 A panel for each range shows one seed, the one with the median `landscape/behind_cosine` (the lower of two): the mean
 cosine between gradient and way to the expert over all points with a negative alpha, over all rollouts, steps and
@@ -35,7 +36,8 @@ NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
 STEPS = 10  # of a trajectory, at which arrows stand
 TRAJECTORIES = 1
-MARGIN = 0.3  # around current trajectory and expert, as a share of the longer side
+REACH = 0.7  # how far the frame follows a policy that leaves the expert, as a share of the expert's longer side
+MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
 TOWARDS, AWAY = "#009E73", "#CC79A7"
 ARROW = 0.03  # length, as a share of the frame's width
 
@@ -85,11 +87,17 @@ class VectorFieldRecord:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top of all that is shown but for the arrows, with a margin."""
-        paths = [getattr(field, kind)[:TRAJECTORIES] for field in self.fields for kind in ("current", "expert")]
-        points = np.concatenate([path.reshape(-1, 2) for path in paths])
-        points = points[np.isfinite(points).all(axis=1)]
-        (left, bottom), (right, top) = points.min(axis=0), points.max(axis=0)
+        """Left, right, bottom and top of all that is shown but for the arrows, with a margin; of a policy that is far
+        away no more than REACH times the expert's longer side.
+        """
+        current, expert = (
+            np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in self.fields])
+            for kind in ("current", "expert")
+        )
+        low, high = expert.min(axis=0), expert.max(axis=0)
+        reach = REACH * (high - low).max()
+        seen = np.clip(current[np.isfinite(current).all(axis=1)], low - reach, high + reach)
+        (left, bottom), (right, top) = (f(np.concatenate([expert, seen]), axis=0) for f in (np.min, np.max))
         margin = MARGIN * max(right - left, top - bottom)
         return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
 
@@ -213,7 +221,7 @@ def draw(record: VectorFieldRecord) -> Figure:
     left, right, bottom, top = frame = record.frame
     beside = top - bottom > 0.8 * (right - left)
     rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)
-    tall = float(np.clip(2.9 / columns * (top - bottom) / (right - left), 0.6, 3.0))
+    tall = float(np.clip(2.6 / columns * (top - bottom) / (right - left), 0.6, 3.0))
     with style.sheet():
         figure = style.new_figure(height=0.9 + rows * (tall + 0.2))
         panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
