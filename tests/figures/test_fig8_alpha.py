@@ -166,11 +166,3 @@ def test_what_cannot_be_drawn_is_said(store: Store, add_run: Any) -> None:
     half = add_run(1, spec=ablation_specs("alpha", "smoke")[BOTH], epochs={"train/mse": [1.0, 0.5, 0.4]})
     with pytest.raises(InputError, match=rf"^run {half[:8]} \(finished\) has no discriminator/generated yet; "):
         fig8_alpha.collect(store, [half])
-
-
-def test_an_environment_without_such_an_error_is_refused(store: Store, vary_alpha: Any) -> None:
-    vary_alpha({(0, 1): [0.01], (-1, 1): [0.003]}, "letters")
-    with pytest.raises(
-        InputError, match=r"^fig8 draws runs on mocap or yjunction, not on letters; choose one of these"
-    ):
-        fig8_alpha.collect(store, environment="letters")

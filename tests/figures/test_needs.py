@@ -109,15 +109,16 @@ def test_figures_that_cannot_be_drawn_are_told(store: Store, add_run: Any) -> No
     assert undrawable["fig7"].startswith("fig7 has nothing to draw")
 
 
-def test_what_other_readers_need_is_kept_too_and_whole(filled: Store) -> None:
+def test_what_other_readers_need_is_kept_too_as_thin_as_figures_want_it(filled: Store) -> None:
     runs = settled_cells(filled.runs())
     shown = next(run for run, names in needs(filled, runs).wanted.arrays.items() if "test/rollouts" in names)
 
     def read(store: Store) -> None:
         store.metrics([shown], ["actor/loss"])
         store.array(shown, "test/rollouts")
+        store.array(shown, "lane_centres")
 
     wanted = needs(filled, runs, [read]).wanted
     assert "actor/loss" in wanted.curves
-    assert wanted.arrays[shown]["test/rollouts"] is None
-    assert wanted.arrays[shown]["test/lanes"] is not None
+    assert wanted.arrays[shown]["test/rollouts"] is not None
+    assert wanted.arrays[shown]["lane_centres"] is None

@@ -84,10 +84,7 @@ def collect(
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
     """
     selection = select_ablation(store, NAME, runs, profile, environment)
-    where = selection.runs[0].environment
-    if where not in ERRORS:
-        raise InputError(f"{NAME} draws runs on {' or '.join(ERRORS)}, not on {where}; choose one of these with --env.")
-    kind = ERRORS[where]
+    kind = ERRORS[selection.runs[0].environment]
     error = f"train/{kind}"
     errors = _bands(store, selection, error, [error], statistic)
     losses = _bands(store, selection, LOSS, TERMS, statistic)
