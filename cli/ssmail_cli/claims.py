@@ -17,11 +17,10 @@ if TYPE_CHECKING:
 
 SUMMARY = {
     "claim": "claim",
-    "alias": "",
     "profile": "runs of",
     "verdict": "verdict",
     "p": "p",
-    "corrected": "of all eight (Holm)",
+    "corrected": "of all eight",
     "p_holm": "p (Holm)",
     "more_seeds": "more seeds",
 }
@@ -87,8 +86,7 @@ def _summary(found: "Judgement") -> dict[str, Any]:
     decision = found.decision
     unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
-        "claim": found.claim.name,
-        "alias": found.claim.alias,
+        "claim": f"{found.claim.name} {found.claim.alias}",
         "profile": found.profile,
         "verdict": found.verdict.value,
         "p": decision.p,
