@@ -150,3 +150,11 @@ class GatherRecurrentDecoder(nn.Module):
             hidden = (1 - update) * torch.tanh(c + torch.sigmoid(r + mr) * mc) + update * hidden
             velocities.append(x[:, step, :, a : 2 * a] + dense.head(hidden))
         return torch.stack(velocities, dim=1), hidden
+
+
+def make_plain(encoder: DynamicEncoder | StaticEncoder, decoder: MessageDecoder | RecurrentDecoder) -> None:
+    """Give these networks the plain forward pass, with the weights and the names that they have."""
+    in_full = GatherDynamicEncoder if isinstance(encoder, DynamicEncoder) else GatherStaticEncoder
+    encoder.forward = in_full(encoder).forward
+    by_index = GatherMessageDecoder if isinstance(decoder, MessageDecoder) else GatherRecurrentDecoder
+    decoder.forward = by_index(decoder).forward
