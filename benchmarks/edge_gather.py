@@ -58,7 +58,7 @@ def on_edges(perceptron: EdgePerceptron, x: Tensor, *skip: Tensor) -> Tensor:
 
 def messages_of(perceptron: PairPerceptron, x: Tensor) -> Tensor:
     first = on_ends(x, perceptron.first.sender, perceptron.first.receiver)
-    return perceptron.activation(perceptron.second(perceptron.activation(first)))
+    return perceptron.activation.apply(perceptron.second(perceptron.activation.apply(first)))
 
 
 class GatherEmbedding(nn.Module):
