@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.decoders import ActivatedMessages, MessageDecoder, PairPerceptron, RecurrentDecoder
+from ssmail.models.edge_layers import RELU, TANH
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron
 from ssmail.models.variational_encoder import DynamicEncoder, EdgeEmbedding, StaticEncoder
 
@@ -58,7 +59,8 @@ def on_edges(perceptron: EdgePerceptron, x: Tensor, *skip: Tensor) -> Tensor:
 
 def messages_of(perceptron: PairPerceptron, x: Tensor) -> Tensor:
     first = on_ends(x, perceptron.first.sender, perceptron.first.receiver)
-    return perceptron.activation.apply(perceptron.second(perceptron.activation.apply(first)))
+    activation = {TANH: torch.tanh, RELU: torch.relu}[perceptron.activation]
+    return activation(perceptron.second(activation(first)))
 
 
 class GatherEmbedding(nn.Module):

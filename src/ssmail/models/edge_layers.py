@@ -4,12 +4,14 @@ For the edge from agent i to agent j, h_ij = act(s_i + r_j + E e_ij) and m_ij = 
 the first layer, applied per agent; e_ij is an optional embedding of the edge. Agent j receives the mean over its senders
 of w_ij m_ij. On recorded motion (31 agents, 930 edges, 50 steps) each of these tensors has hundreds of megabytes; written
 as one operation after the other, most of the time goes into moving them. Here all operations are done for as many steps
-as fit into the processor's cache, forwards and backwards, and only h and m are kept.
+as fit into the processor's cache, forwards and backwards. m is kept for the gradient, and h only where it depends on e: it is
+cheaper to compute than to fetch.
 
 Only the N * (N - 1) edges between different agents are there, receiver by receiver: axis -3 of an edge tensor (..., N,
 N - 1, H) is the receiver j, axis -2 its senders in order, j left out.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -30,11 +32,18 @@ class Activation:
     gradient: Callable[[Tensor, Tensor], Tensor]
 
 
-ELU = Activation(
-    lambda x: torch.nn.functional.elu(x, inplace=True),
-    lambda g, result: torch.ops.aten.elu_backward(g, 1.0, 1.0, 1.0, True, result),
-)
-TANH = Activation(torch.tanh_, torch.ops.aten.tanh_backward)
+def elu_(x: Tensor) -> Tensor:
+    """max(x, 2^(min(x, 0) / ln 2) - 1), in place: torch's, by expm1, takes more than twice the time."""
+    return torch.maximum(x, (x * (1 / math.log(2))).clamp_(max=0).exp2_().sub_(1), out=x)
+
+
+def tanh_(x: Tensor) -> Tensor:
+    """2 s(2 x) - 1 with the logistic function s, in place, in a quarter of the time of torch's."""
+    return x.mul_(2).sigmoid_().mul_(2).sub_(1)
+
+
+ELU = Activation(elu_, lambda g, result: torch.ops.aten.elu_backward(g, 1.0, 1.0, 1.0, True, result))
+TANH = Activation(tanh_, torch.ops.aten.tanh_backward)
 RELU = Activation(torch.relu_, lambda g, result: torch.ops.aten.threshold_backward(g, result, 0))
 
 
@@ -45,6 +54,12 @@ def parts(batch: int, steps: int, size: int) -> Iterator[Part]:
     for b in range(0, batch, trajectories):
         for t in range(0, steps, length):
             yield slice(b, b + trajectories), slice(t, t + length)
+
+
+def first_layer(s: Tensor, r: Tensor) -> Tensor:
+    """s_i + r_j of a part of the steps, (B, T, N, H) twice -> (B * T * N * (N - 1), H)."""
+    pairs = s.flatten(0, 1).unsqueeze(1) + r.flatten(0, 1).unsqueeze(2)
+    return between_different(pairs).reshape(-1, s.shape[-1])
 
 
 def between_different(pairs: Tensor) -> Tensor:
@@ -65,14 +80,12 @@ class EdgeLayers(torch.autograd.Function):
         of the second layer; weights (B, T, N, N - 1) of the mean over senders, or None where all are equal.
         """
         b, t, n, h = s.shape
-        first, second, received = s.new_empty(b, t, n, n - 1, h), s.new_empty(b, t, n, n - 1, h), torch.empty_like(s)
+        second, received, first = s.new_empty(b, t, n, n - 1, h), torch.empty_like(s), []
         squares, near = s.new_zeros(h), None
         for k in parts(b, t, n * (n - 1) * h):
-            hidden, out = first[k].flatten(0, 3), second[k].flatten(0, 3)
-            pairs = s[k].flatten(0, 1).unsqueeze(1) + r[k].flatten(0, 1).unsqueeze(2)
-            hidden.view(-1, n - 1, n, h).copy_(between_different(pairs))
+            hidden, out = first_layer(s[k], r[k]), second[k].flatten(0, 3)
             if edges is not None and edge_weight is not None:
-                hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t())
+                first.append(hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t()))
             torch.addmm(bias, activation.apply(hidden), weight.t(), out=out)
             activation.apply(out)
             if weights is None:
@@ -83,7 +96,7 @@ class EdgeLayers(torch.autograd.Function):
                 received[k] = (weights[k].unsqueeze(-2) @ second[k]).squeeze(-2)
         mean = received.mean(dim=(0, 1, 2))
         variance = squares if near is None else squares / (second.numel() // h) - (mean - near).square()
-        ctx.save_for_backward(first, second, edges, edge_weight, weight, weights, mean)
+        ctx.save_for_backward(s, r, second, edges, edge_weight, weight, weights, mean, *first)
         ctx.activation = activation
         ctx.set_materialize_grads(False)
         return second, received, variance
@@ -91,17 +104,16 @@ class EdgeLayers(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, by_second: Tensor | None, by_received: Tensor | None, by_variance: Tensor | None) -> Any:
         """The gradients of s, r, edges, edge_weight, weight, bias and weights."""
-        first, second, edges, edge_weight, weight, weights, mean = ctx.saved_tensors
+        s, r, second, edges, edge_weight, weight, weights, mean, *first = ctx.saved_tensors
         b, t, n, _, h = second.shape
         if by_received is None:
             by_received = second.new_zeros(b, t, n, h)
         slope = None if by_variance is None else by_variance * (2 * h / second.numel())
         of_s, of_r = second.new_empty(b, t, n, h), second.new_empty(b, t, n, h)
         of_edges, of_edge_weight = (None if x is None else torch.zeros_like(x) for x in (edges, edge_weight))
-        of_weight, of_bias, of_weights = torch.zeros_like(weight), weight.new_zeros(h), None
-        if weights is not None:
-            of_weights = torch.empty_like(weights)
-        for k in parts(b, t, n * (n - 1) * h):
+        of_weight, of_bias = torch.zeros_like(weight), weight.new_zeros(h)
+        of_weights, pairs = (None if weights is None else torch.empty_like(weights)), None
+        for number, k in enumerate(parts(b, t, n * (n - 1) * h)):
             g, m = by_received[k].unsqueeze(-2), second[k]
             if weights is not None:
                 of_weights[k] = (m @ g.transpose(-1, -2)).squeeze(-1)
@@ -111,16 +123,17 @@ class EdgeLayers(torch.autograd.Function):
             if slope is not None:
                 g = torch.addcmul(g - slope * mean, m, slope)
             if by_second is not None:
-                g = g + by_second[k]
+                g = by_second[k] + g
             g = ctx.activation.gradient(g.expand_as(m), m).flatten(0, 3)
-            hidden = first[k].flatten(0, 3)
+            hidden = ctx.activation.apply(first_layer(s[k], r[k])) if edges is None else first[number]
             of_weight.addmm_(g.t(), hidden)
             of_bias += g.sum(dim=0)
             g = ctx.activation.gradient(g @ weight, hidden)
             if edges is not None:
                 torch.mm(g, edge_weight, out=of_edges[k].flatten(0, 3))
                 of_edge_weight.addmm_(g.t(), edges[k].flatten(0, 3))
-            pairs = g.new_zeros(len(g) // (n * (n - 1)), n, n, h)
-            between_different(pairs).copy_(g.view(-1, n - 1, n, h))
+            steps = len(g) // (n * (n - 1))
+            pairs = g.new_zeros(steps, n, n, h) if pairs is None else pairs[:steps]  # no part is larger than the first
+            between_different(pairs).copy_(g.view(steps, n - 1, n, h))
             of_s[k], of_r[k] = pairs.sum(dim=1).view_as(of_s[k]), pairs.sum(dim=2).view_as(of_r[k])
         return of_s, of_r, of_edges, of_edge_weight, of_weight, of_bias, of_weights, None

@@ -11,6 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.edge_layers import tanh_
+
 
 def directions(steps: int) -> tuple[Sequence[int], Sequence[int]]:
     """The order in which each direction goes through the steps."""
@@ -29,32 +31,28 @@ class BothWays(torch.autograd.Function):
         """The weights of both directions: by_input (2, 4 * H, D), by_hidden (2, 4 * H, H), bias (2, 4 * H)."""
         t, e, _ = x.shape
         h = by_hidden.shape[-1]
-        gates, cells, hiddens = x.new_empty(2, t, 4 * h, e), x.new_empty(2, t, h, e), x.new_empty(2, t, h, e)
-        out = x.new_empty(t, e, 2 * h)
+        gates, cells, out = x.new_empty(2, t, 4 * h, e), x.new_empty(2, t, h, e), x.new_empty(t, e, 2 * h)
         twice = x.new_ones(4, h)
         twice[2] = 2  # the gate whose activation is tanh
         for way, order in enumerate(directions(t)):
-            weights = [(w * twice.view(-1, 1)) for w in (by_input[way], by_hidden[way], bias[way].unsqueeze(-1))]
-            before: int | None = None
+            of_input, of_hidden, added = (
+                w * twice.view(-1, 1) for w in (by_input[way], by_hidden[way], bias[way].unsqueeze(-1))
+            )
+            hidden = past = x.new_zeros(h, e)
             for now in order:
-                gate, cell, hidden = gates[way, now], cells[way, now], hiddens[way, now]
-                torch.addmm(weights[2], weights[0], x[now].t(), out=gate)
-                if before is not None:
-                    gate.addmm_(weights[1], hiddens[way, before])
-                i, f, g, o = gate.sigmoid_().chunk(4)
-                torch.mul(i, g.mul_(2).sub_(1), out=cell)
-                if before is not None:
-                    cell.addcmul_(f, cells[way, before])
-                torch.mul(o, tanh(cell), out=hidden)
+                gate, cell = gates[way, now], cells[way, now]
+                torch.addmm(added, of_input, x[now].t(), out=gate)
+                i, f, g, o = gate.addmm_(of_hidden, hidden).sigmoid_().chunk(4)
+                torch.mul(i, g.mul_(2).sub_(1), out=cell).addcmul_(f, past)
+                hidden, past = tanh_(cell.clone()).mul_(o), cell
                 out[now, :, way * h : (way + 1) * h] = hidden.t()
-                before = now
-        ctx.save_for_backward(x, by_input, by_hidden, gates, cells, hiddens)
+        ctx.save_for_backward(x, by_input, by_hidden, gates, cells, out)
         return out
 
     @staticmethod
     def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The gradients of x and of the weights."""
-        x, by_input, by_hidden, gates, cells, hiddens = ctx.saved_tensors
+        x, by_input, by_hidden, gates, cells, out = ctx.saved_tensors
         t, _, _ = x.shape
         h = by_hidden.shape[-1]
         of_x, of_input, of_hidden = torch.empty_like(x), torch.zeros_like(by_input), torch.zeros_like(by_hidden)
@@ -72,14 +70,9 @@ class BothWays(torch.autograd.Function):
                 of_input[way].addmm_(change, x[now])
                 of_bias[way] += change.sum(dim=1)
                 if before is not None:
-                    of_hidden[way].addmm_(change, hiddens[way, before].t())
+                    of_hidden[way].addmm_(change, out[before, :, way * h : (way + 1) * h])
                 torch.addmm(of_x[now], change.t(), by_input[way], beta=way, out=of_x[now])
         return of_x, of_input, of_hidden, of_bias
-
-
-def tanh(x: Tensor) -> Tensor:
-    """By the logistic function."""
-    return (2 * x).sigmoid_().mul_(2).sub_(1)
 
 
 def gate_gradients(
@@ -89,7 +82,7 @@ def gate_gradients(
     cell, from the gradients of the hidden state and of the cell (H, E).
     """
     (i, f, g, o), (of_i, of_f, of_g, of_o) = gates.chunk(4), change.chunk(4)
-    squashed = tanh(cell)
+    squashed = tanh_(cell.clone())
     backward = torch.ops.aten.sigmoid_backward.grad_input
     backward(by_hidden * squashed, o, grad_input=of_o)
     by_cell = by_cell + torch.ops.aten.tanh_backward(by_hidden.mul_(o), squashed)

@@ -13,6 +13,7 @@ All logits are (B, T, N, N, K), sender first, and zero on the diagonal, where th
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.edge_layers import CHUNK
 from ssmail.models.edge_memory import both_ways
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron, ScaledEdges, edge_graph
 from ssmail.models.graph_encoder import Memory, remember
@@ -55,7 +56,7 @@ class StaticEncoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Observed steps x (B, T, N, F) -> posterior logits (B, 1, N, N, K)."""
         edges: ScaledEdges = self.embedding(x)
-        return edge_graph(self.head(edges.values.mean(dim=1, keepdim=True) * edges.scale + edges.shift))
+        return edge_graph(self.head(edges.values.sum(dim=1, keepdim=True) * (edges.scale / x.shape[1]) + edges.shift))
 
     def running(self, x: Tensor) -> Tensor:
         """(B, T, N, F) -> (B, T, N, N, K): for each step the logits given the steps up to it."""
@@ -71,6 +72,7 @@ class DynamicEncoder(nn.Module):
         self.embedding = EdgeEmbedding(inputs, spec.hidden, spec.batch_norm)
         self.past = nn.LSTM(spec.hidden, spec.memory)
         self.future = nn.LSTM(spec.hidden, spec.memory)
+        self.head_size = spec.head
         self.prior_head = edge_type_head(spec.memory, spec)
         self.posterior_head = edge_type_head(2 * spec.memory, spec)
 
@@ -95,5 +97,6 @@ class DynamicEncoder(nn.Module):
     def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:
         """(T, B * N * (N - 1), H) -> (B, T, N, N, K)."""
         b, t, n, _ = x.shape
-        logits: Tensor = head(sequences)
+        in_cache = max(CHUNK // (b * n * n * self.head_size), 1)
+        logits = torch.cat([head(steps) for steps in sequences.split(in_cache)])
         return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))
