@@ -133,7 +133,8 @@ class EdgeLayers(torch.autograd.Function):
                 torch.mm(g, edge_weight, out=of_edges[k].flatten(0, 3))
                 of_edge_weight.addmm_(g.t(), edges[k].flatten(0, 3))
             steps = len(g) // (n * (n - 1))
-            pairs = g.new_zeros(steps, n, n, h) if pairs is None else pairs[:steps]  # no part is larger than the first
+            if pairs is None or len(pairs) != steps:
+                pairs = g.new_zeros(steps, n, n, h)
             between_different(pairs).copy_(g.view(steps, n - 1, n, h))
             of_s[k], of_r[k] = pairs.sum(dim=1).view_as(of_s[k]), pairs.sum(dim=2).view_as(of_r[k])
         return of_s, of_r, of_edges, of_edge_weight, of_weight, of_bias, of_weights, None

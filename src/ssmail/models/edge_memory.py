@@ -12,6 +12,9 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.edge_layers import tanh_
+from ssmail.models.graph_encoder import remember
+
+ONE_BY_ONE_UP_TO = 2**13  # edges times hidden size: up to so many, two calls of torch's LSTM are faster
 
 
 def directions(steps: int) -> tuple[Sequence[int], Sequence[int]]:
@@ -96,7 +99,12 @@ def gate_gradients(
 
 
 def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> Tensor:
-    """BothWays of scale * x + shift by the weights of two LSTMs of one layer; scale and shift (D,)."""
+    """The hidden states (T, E, 2 * H) of two LSTMs of one layer over scale * x + shift, `past` forward in time and
+    `future` backward: x (T, E, D), scale and shift (D,).
+    """
+    if x.shape[1] * past.hidden_size < ONE_BY_ONE_UP_TO:
+        x = x * scale + shift
+        return torch.cat([remember(past, x, None)[0], remember(future, x.flip(0), None)[0].flip(0)], dim=-1)
     weights = [lstm.all_weights[0] for lstm in (past, future)]
     by_input, by_hidden = (torch.stack([w[place] for w in weights]) for place in (0, 1))
     bias = torch.stack([w[2] + w[3] for w in weights]) + by_input @ shift
