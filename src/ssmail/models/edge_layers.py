@@ -93,7 +93,7 @@ class EdgeLayers(torch.autograd.Function):
                 near = out.mean(dim=0) if near is None else near  # subtracted, so that nothing is lost to rounding
                 squares += (out - near).square_().sum(dim=0)
             else:
-                received[k] = (weights[k].unsqueeze(-2) @ second[k]).squeeze(-2)
+                torch.sum(second[k] * weights[k].unsqueeze(-1), dim=-2, out=received[k])
         mean = received.mean(dim=(0, 1, 2))
         variance = squares if near is None else squares / (second.numel() // h) - (mean - near).square()
         ctx.save_for_backward(s, r, second, edges, edge_weight, weight, weights, mean, *first)
@@ -116,7 +116,7 @@ class EdgeLayers(torch.autograd.Function):
         for number, k in enumerate(parts(b, t, n * (n - 1) * h)):
             g, m = by_received[k].unsqueeze(-2), second[k]
             if weights is not None:
-                of_weights[k] = (m @ g.transpose(-1, -2)).squeeze(-1)
+                torch.sum(m * g, dim=-1, out=of_weights[k])
                 g = g * weights[k].unsqueeze(-1)
             else:
                 g = g / (n - 1)

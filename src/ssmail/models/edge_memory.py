@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.edge_layers import tanh_
-from ssmail.models.graph_encoder import remember
 
 ONE_BY_ONE_UP_TO = 2**13  # edges times hidden size: up to so many, two calls of torch's LSTM are faster
 
@@ -98,15 +97,26 @@ def gate_gradients(
     return by_cell.mul_(f)
 
 
-def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> Tensor:
-    """The hidden states (T, E, 2 * H) of two LSTMs of one layer over scale * x + shift, `past` forward in time and
-    `future` backward: x (T, E, D), scale and shift (D,).
+def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+    """Two LSTMs of one layer over scale * x + shift, `past` forward in time and `future` backward: x (T, E, D), scale
+    and shift (D,) -> the hidden states of the first (T, E, H) and of both (T, E, 2 * H).
+
+    Scale and shift go into the weights.
     """
+    weights = []
+    for by_input, by_hidden, bias, more_bias in (lstm.all_weights[0] for lstm in (past, future)):
+        weights.append((by_input * scale, by_hidden, bias + more_bias + by_input @ shift))
     if x.shape[1] * past.hidden_size < ONE_BY_ONE_UP_TO:
-        x = x * scale + shift
-        return torch.cat([remember(past, x, None)[0], remember(future, x.flip(0), None)[0].flip(0)], dim=-1)
-    weights = [lstm.all_weights[0] for lstm in (past, future)]
-    by_input, by_hidden = (torch.stack([w[place] for w in weights]) for place in (0, 1))
-    bias = torch.stack([w[2] + w[3] for w in weights]) + by_input @ shift
-    out: Tensor = BothWays.apply(x, by_input * scale, by_hidden, bias)  # type: ignore[no-untyped-call]  # torch's
-    return out
+        forward, backward = one_way(x, *weights[0]), one_way(x.flip(0), *weights[1]).flip(0)
+        return forward, torch.cat([forward, backward], dim=-1)
+    both: Tensor = BothWays.apply(x, *(torch.stack(pair) for pair in zip(*weights, strict=True)))  # type: ignore[no-untyped-call]  # torch's
+    return both[..., : past.hidden_size], both
+
+
+def one_way(x: Tensor, by_input: Tensor, by_hidden: Tensor, bias: Tensor) -> Tensor:
+    """Torch's LSTM with these weights, from zeros: x (T, E, D) -> (T, E, H)."""
+    start = x.new_zeros(1, x.shape[1], by_hidden.shape[1])
+    if not x.shape[1]:
+        return x.new_zeros(len(x), 0, by_hidden.shape[1])
+    weights = [by_input, by_hidden, bias, torch.zeros_like(bias)]
+    return torch.lstm(x, (start, start), weights, True, 1, 0.0, True, False, False)[0]

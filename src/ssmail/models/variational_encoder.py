@@ -81,8 +81,7 @@ class DynamicEncoder(nn.Module):
         reads all of x; both (B, T, N, N, K).
         """
         edges: ScaledEdges = self.embedding(x.transpose(0, 1))
-        both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
-        past = both[..., : self.past.hidden_size]
+        past, both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
         return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
 
     def prior(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
