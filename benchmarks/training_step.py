@@ -1,9 +1,9 @@
 """CPU seconds and peak memory of a training step of dnri and nri, in ssmail's form and in the plain one.
 
 A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The plain form replaces the
-networks' forward passes by those of edge_gather.py; weights, inputs and random numbers are the same. Each measurement is
-a fresh process with one thread, so that its peak memory is its own; the forms take turns. The first step of each process
-warms it up and is not counted; its results are what the two forms are compared by.
+networks' forward passes by those of edge_gather.py; weights, inputs and random numbers are the same. Each measurement
+is a fresh process with one thread, so that its peak memory is its own; the forms take turns. The first step of each
+process warms it up and is not counted; its results are what the two forms are compared by.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
     for hook in hooks:
         hook.remove()
     gradients = {f"gradient of {name}": p.grad.clone() for name, p in learner.model.named_parameters()}
-    return {name: torch.tensor(value) for name, value in metrics.items()} | seen | gradients
+    return {name: torch.tensor(value, dtype=torch.float64) for name, value in metrics.items()} | seen | gradients
 
 
 def largest_difference(plain: dict[str, Tensor], ours: dict[str, Tensor]) -> tuple[float, float]:
@@ -146,7 +146,9 @@ def compare_steps(method: str, size: str, rounds: int, steps: int) -> None:
         raise SystemExit(f"the two forms of {method} differ by {relative:.1e} of the largest value: more than rounding")
 
 
-def report(sizes: Sequence[str], methods: Sequence[str] = tuple(BATCH), rounds: int = ROUNDS, steps: int = STEPS) -> None:
+def report(
+    sizes: Sequence[str], methods: Sequence[str] = tuple(BATCH), rounds: int = ROUNDS, steps: int = STEPS
+) -> None:
     """A table of all sizes and methods."""
     print(f"\n{'training step':<34}{'CPU s':>10}{'peak MB':>10}{'faster':>8}{'smaller':>8}")
     for size in sizes:
@@ -161,7 +163,9 @@ def main(given: Sequence[str]) -> None:
         print(json.dumps(measure(method, size, form, int(steps), results)))
         return
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="only the sizes of the profile quick: seconds, not minutes")
+    parser.add_argument(
+        "--quick", action="store_true", help="only the sizes of the profile quick: seconds, not minutes"
+    )
     parser.add_argument("--sizes", nargs="+", choices=SIZES)
     parser.add_argument("--methods", nargs="+", choices=BATCH, default=list(BATCH))
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="processes of each form")

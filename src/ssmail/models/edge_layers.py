@@ -1,11 +1,11 @@
 """The two layers of an edge's perceptron and what is summed up of them, a few steps at a time.
 
-For the edge from agent i to agent j, h_ij = act(s_i + r_j + E e_ij) and m_ij = act(W h_ij + b): s and r are the halves of
-the first layer, applied per agent; e_ij is an optional embedding of the edge. Agent j receives the mean over its senders
-of w_ij m_ij. On recorded motion (31 agents, 930 edges, 50 steps) each of these tensors has hundreds of megabytes; written
-as one operation after the other, most of the time goes into moving them. Here all operations are done for as many steps
-as fit into the processor's cache, forwards and backwards. m is kept for the gradient, and h only where it depends on e: it is
-cheaper to compute than to fetch.
+For the edge from agent i to agent j, h_ij = act(s_i + r_j + E e_ij) and m_ij = act(W h_ij + b): s and r are the halves
+of the first layer, applied per agent; e_ij is an optional embedding of the edge. Agent j receives the mean over its
+senders of w_ij m_ij. On recorded motion (31 agents, 930 edges, 50 steps) each of these tensors has hundreds of
+megabytes; written as one operation after the other, much of the time goes into moving them. Here all operations are
+done for as many steps as fit into the processor's cache, forwards and backwards. m is kept for the gradient, and h only
+where it depends on e: otherwise it is cheaper to compute again than to fetch.
 
 Only the N * (N - 1) edges between different agents are there, receiver by receiver: axis -3 of an edge tensor (..., N,
 N - 1, H) is the receiver j, axis -2 its senders in order, j left out.
@@ -48,7 +48,7 @@ RELU = Activation(torch.relu_, lambda g, result: torch.ops.aten.threshold_backwa
 
 
 def parts(batch: int, steps: int, size: int) -> Iterator[Part]:
-    """Divide (B, T) into parts of about CHUNK numbers, where a step has `size`: whole trajectories if they are short."""
+    """Divide (B, T) into parts of about CHUNK numbers, where a step has `size`; of whole trajectories if they fit."""
     fitting = max(CHUNK // max(size, 1), 1)
     trajectories, length = max(fitting // max(steps, 1), 1), min(fitting, steps)
     for b in range(0, batch, trajectories):

@@ -1,8 +1,8 @@
 """Two LSTMs along every edge, one forward and one backward in time, as one function.
 
-It equals two calls of torch's LSTM to rounding and takes about half the time. Numbers of a step lie features first, so
-that a gate of all edges is one block of memory and every operation runs over whole blocks; x is multiplied by the weights
-where it lies, and both directions add to one gradient of x.
+It equals two calls of torch's LSTM to rounding, in less time. The numbers of a step lie features first, so that a gate
+of all edges is one block of memory and every operation runs over whole blocks; x is multiplied by the weights where it
+lies, and both directions add to one gradient of x.
 """
 
 from collections.abc import Sequence
@@ -24,8 +24,8 @@ def directions(steps: int) -> tuple[Sequence[int], Sequence[int]]:
 class BothWays(torch.autograd.Function):
     """x (T, E, D) -> the hidden states of both directions (T, E, 2 * H), the forward one first.
 
-    With gates i, f, g, o: c <- s(f) c + s(i) tanh(g) and h <- s(o) tanh(c), where s is the logistic function and tanh(x)
-    = 2 s(2 x) - 1, which costs a quarter of torch's.
+    With gates i, f, g, o: c <- s(f) c + s(i) tanh(g) and h <- s(o) tanh(c), where s is the logistic function; tanh is
+    that of edge_layers.
     """
 
     @staticmethod
