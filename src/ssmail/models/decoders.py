@@ -56,7 +56,7 @@ class ActivatedMessages(nn.Module):
         """
         n = graph.shape[2]
         edges = off_diagonal(graph[..., self.skipped :].transpose(2, 3))
-        return edges.unflatten(2, (n, n - 1)) / max(n - 1, 1)
+        return edges.reshape(*edges.shape[:2], n, n - 1, edges.shape[-1]) / max(n - 1, 1)
 
     def forward(self, x: Tensor, weights: Tensor) -> Tensor:
         """x (B, T, N, D) and weights (B, T, N, N - 1, K or K - 1) -> (B, T, N, H)."""
@@ -120,7 +120,7 @@ class RecurrentDecoder(nn.Module):
         from_inputs = self.inputs(x)
         hidden = x.new_zeros(b, n, self.size) if memory is None else memory
         states = []
-        for inputs, weight in zip(from_inputs.unbind(1), weights.split(1, dim=1), strict=True):
+        for inputs, weight in zip(from_inputs.unbind(1), torch.split(weights, 1, dim=1), strict=True):
             hidden = self._update(hidden, inputs, weight)
             states.append(hidden)
         a = self.action_size

@@ -64,8 +64,8 @@ def first_layer(s: Tensor, r: Tensor) -> Tensor:
 
 def between_different(pairs: Tensor) -> Tensor:
     """The view (M, N - 1, N, H) of pairs (M, N, N, H) that has the edges in the order of a tensor (M, N, N - 1, H)."""
-    n = pairs.shape[1]
-    return pairs.flatten(1, 2)[:, 1:].unflatten(1, (n - 1, n + 1))[:, :, :n]
+    m, n, _, h = pairs.shape
+    return pairs.flatten(1, 2)[:, 1:].view(m, n - 1, n + 1, h)[:, :, :n]
 
 
 class EdgeLayers(torch.autograd.Function):
@@ -115,7 +115,7 @@ class EdgeLayers(torch.autograd.Function):
         of_weights, pairs = (None if weights is None else torch.empty_like(weights)), None
         for number, k in enumerate(parts(b, t, n * (n - 1) * h)):
             g, m = by_received[k].unsqueeze(-2), second[k]
-            if weights is not None:
+            if weights is not None and of_weights is not None:
                 torch.sum(m * g, dim=-1, out=of_weights[k])
                 g = g * weights[k].unsqueeze(-1)
             else:
@@ -129,7 +129,7 @@ class EdgeLayers(torch.autograd.Function):
             of_weight.addmm_(g.t(), hidden)
             of_bias += g.sum(dim=0)
             g = ctx.activation.gradient(g @ weight, hidden)
-            if edges is not None:
+            if of_edges is not None and of_edge_weight is not None:
                 torch.mm(g, edge_weight, out=of_edges[k].flatten(0, 3))
                 of_edge_weight.addmm_(g.t(), edges[k].flatten(0, 3))
             steps = len(g) // (n * (n - 1))

@@ -97,5 +97,5 @@ class DynamicEncoder(nn.Module):
         """(T, B * N * (N - 1), H) -> (B, T, N, N, K)."""
         b, t, n, _ = x.shape
         in_cache = max(CHUNK // (b * n * n * self.head_size), 1)
-        logits = torch.cat([head(steps) for steps in sequences.split(in_cache)])
+        logits = torch.cat([head(steps) for steps in torch.split(sequences, in_cache)])
         return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))
