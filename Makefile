@@ -35,7 +35,7 @@ check: $(INSTALLED)  ## lint, format and types
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 
-bench: $(INSTALLED)  ## how long the command line, an epoch and the store take
+bench: $(INSTALLED)  ## how long the command line, an epoch, the store and a training step take (about 10 minutes)
 	$(BIN)/python benchmarks/run.py
 
 clean:  ## remove caches and build outputs; .venv and results/ stay

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.decoders import ActivatedMessages, MessageDecoder, PairPerceptron, RecurrentDecoder
+from ssmail.models.edge_layers import RELU, TANH
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron
 from ssmail.models.variational_encoder import DynamicEncoder, EdgeEmbedding, StaticEncoder
 
@@ -58,7 +59,8 @@ def on_edges(perceptron: EdgePerceptron, x: Tensor, *skip: Tensor) -> Tensor:
 
 def messages_of(perceptron: PairPerceptron, x: Tensor) -> Tensor:
     first = on_ends(x, perceptron.first.sender, perceptron.first.receiver)
-    return perceptron.activation(perceptron.second(perceptron.activation(first)))
+    activation = {TANH: torch.tanh, RELU: torch.relu}[perceptron.activation]
+    return activation(perceptron.second(activation(first)))
 
 
 class GatherEmbedding(nn.Module):
@@ -150,3 +152,11 @@ class GatherRecurrentDecoder(nn.Module):
             hidden = (1 - update) * torch.tanh(c + torch.sigmoid(r + mr) * mc) + update * hidden
             velocities.append(x[:, step, :, a : 2 * a] + dense.head(hidden))
         return torch.stack(velocities, dim=1), hidden
+
+
+def make_plain(encoder: DynamicEncoder | StaticEncoder, decoder: MessageDecoder | RecurrentDecoder) -> None:
+    """Give these networks the plain forward pass, with the weights and the names that they have."""
+    in_full = GatherDynamicEncoder if isinstance(encoder, DynamicEncoder) else GatherStaticEncoder
+    encoder.forward = in_full(encoder).forward
+    by_index = GatherMessageDecoder if isinstance(decoder, MessageDecoder) else GatherRecurrentDecoder
+    decoder.forward = by_index(decoder).forward

@@ -14,6 +14,7 @@ from torch import nn
 from ssmail.experiments import build_spec
 from ssmail.losses.likelihood import variational_loss
 from ssmail.models.decoders import MessageDecoder, make_decoder
+from ssmail.models.edge_perceptron import ScaledEdges
 from ssmail.models.graph_encoder import GraphNoise, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder
 from ssmail.spec import VariationalSpec, used
@@ -50,7 +51,12 @@ def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, sp
     """The edges' embeddings and the decoder under a given graph: no LSTM, no heads, no loss."""
     b, t, n, _ = states.shape
     graph = torch.softmax(torch.randn(b, t, n, n, spec.edge_types), dim=-1)
-    return lambda: embed(states).sum() + decoder(states, graph)[0].sum()
+
+    def work() -> torch.Tensor:
+        edges = embed(states)
+        return (edges.tensor() if isinstance(edges, ScaledEdges) else edges).sum() + decoder(states, graph)[0].sum()
+
+    return work
 
 
 def forms_of(name: str) -> dict[str, tuple[Work, Work]]:

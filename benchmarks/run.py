@@ -1,5 +1,5 @@
-"""`make bench`: how long the command line, an epoch of training (one thread), the store and dnri's message passing take
-on this machine.
+"""`make bench`: how long the command line, an epoch of training (one thread), the store, dnri's message passing and a
+training step of dnri and nri take on this machine.
 """
 
 import statistics
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import torch
 from message_passing import compare
+from training_step import report
 
 from ssmail.experiments import build_spec
 from ssmail.store import Store
@@ -57,3 +58,4 @@ if __name__ == "__main__":
     for name, measure in (("ssmail --help", help_text), ("epoch (quick)", epoch), ("stored epoch", stored_epoch)):
         print(f"{name:<16}{measure():9.4f} s", flush=True)
     compare()
+    report(["authors", "quick"])

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ssmail.models.decoders import ActivatedMessages, MessageDecoder, RecurrentDecoder, make_decoder
+from ssmail.models.edge_layers import TANH
 from tests.models.test_message_passing import one_hot_graph
 from tests.models.test_variational_encoder import spec
 
@@ -101,7 +102,7 @@ def test_typed_messages_against_the_formula() -> None:
     n, k, x = 4, 3, torch.randn(1, 1, 4, 3)
     graph = torch.rand(1, 1, n, n, k)
     for skipped in (0, 1):
-        layer = ActivatedMessages(3, spec(first_type_is_none=bool(skipped)), torch.tanh)
+        layer = ActivatedMessages(3, spec(first_type_is_none=bool(skipped)), TANH)
         assert len(layer.types) == k - skipped
         expected = torch.zeros(n, layer.size)
         for kind, f in enumerate(layer.types, start=skipped):

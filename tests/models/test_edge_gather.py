@@ -14,6 +14,7 @@ from benchmarks.edge_gather import (
     GatherRecurrentDecoder,
     GatherStaticEncoder,
 )
+from ssmail.models import edge_layers, edge_memory, variational_encoder
 from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from tests.models.test_variational_encoder import spec
@@ -53,6 +54,17 @@ def test_encoders(n: int, batch_norm: bool, training: bool) -> None:
     x = torch.randn(3, 4, n, 5)
     for network, gather in ((DynamicEncoder, GatherDynamicEncoder), (StaticEncoder, GatherStaticEncoder)):
         assert_same(network(5, spec(batch_norm=batch_norm)).train(training), gather, x)
+
+
+def test_encoders_in_parts_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As larger systems are computed."""
+    monkeypatch.setattr(edge_memory, "ONE_BY_ONE_UP_TO", 0)
+    monkeypatch.setattr(edge_layers, "CHUNK", 2 * 4 * 3 * 8)
+    monkeypatch.setattr(variational_encoder, "CHUNK", 2 * 3 * 4 * 4 * 6)
+    torch.manual_seed(0)
+    x = torch.randn(3, 5, 4, 5)
+    for network, gather in ((DynamicEncoder, GatherDynamicEncoder), (StaticEncoder, GatherStaticEncoder)):
+        assert_same(network(5, spec()), gather, x)
 
 
 @agents

@@ -3,13 +3,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssmail.models.edge_perceptron import EdgePerceptron, FeatureNorm, edge_graph, elu, senders
+from ssmail.models.edge_layers import between_different
+from ssmail.models.edge_perceptron import EdgePerceptron, FeatureNorm, ScaledEdges, edge_graph, elu
 
 
-@given(n=st.integers(1, 6))
+@given(n=st.integers(2, 6))
 def test_edges_are_listed_receiver_by_receiver(n: int) -> None:
     listed = [[i for i in range(n) if i != j] for j in range(n)]
-    assert senders(n, torch.device("cpu")).tolist() == [i for row in listed for i in row]
+    senders = torch.arange(n).expand(1, n, n).unsqueeze(-1).contiguous()  # receiver first
+    assert between_different(senders).flatten().tolist() == [i for row in listed for i in row]
     edges = torch.tensor([[i * n + j for i in row] for j, row in enumerate(listed)]).view(1, 1, n, n - 1, 1).float()
     pairs = torch.arange(n * n).view(1, 1, n, n, 1) * (1 - torch.eye(n)).view(n, n, 1)  # sender i, receiver j
     torch.testing.assert_close(edge_graph(edges), pairs, rtol=0, atol=0)
@@ -21,11 +23,16 @@ def test_an_edge_against_the_formula(n: int, seed: int) -> None:
     torch.manual_seed(seed)
     layer = EdgePerceptron(3, 4, batch_norm=False, edge_inputs=2)
     x, extra = torch.randn(1, 1, n, 3), torch.randn(1, 1, n, n - 1, 2)
-    out = layer(x, extra)
+    scale, shift = torch.rand(2), torch.rand(2)
+    out = layer(x, ScaledEdges(extra, extra.mean(dim=-2), scale, shift)).tensor()
     assert layer.edge is not None
     for j in range(n):
         for place, i in enumerate(i for i in range(n) if i != j):
-            first = layer.sender(x[0, 0, i]) + layer.receiver(x[0, 0, j]) + layer.edge(extra[0, 0, j, place])
+            first = (
+                layer.sender(x[0, 0, i])
+                + layer.receiver(x[0, 0, j])
+                + layer.edge(scale * extra[0, 0, j, place] + shift)
+            )
             torch.testing.assert_close(out[0, 0, j, place], elu(layer.second(elu(first))))
 
 
@@ -33,7 +40,9 @@ def test_batch_norm_sees_the_real_edges_only() -> None:
     """Mean 0 and variance 1 over all edges between different agents, and the running statistics are theirs."""
     torch.manual_seed(0)
     layer, x = EdgePerceptron(3, 4, batch_norm=True), torch.randn(5, 2, 3, 3)
-    edges = layer(x).flatten(0, -2)
+    made = layer(x)
+    edges = made.tensor().flatten(0, -2)
+    torch.testing.assert_close(made.received(), made.tensor().mean(dim=-2))
     assert edges.shape[0] == 5 * 2 * 3 * 2
     torch.testing.assert_close(edges.mean(0), torch.zeros(4), atol=1e-5, rtol=0)
     assert bool((edges.var(0, unbiased=False) - 1).abs().max() < 1e-2)

@@ -8,29 +8,32 @@ Inputs x (B, T, N, F) begin with the state [position, velocity] of 2 * A feature
 first; their diagonal is ignored, and T may be 1: one graph for all steps.
 """
 
-from collections.abc import Callable
-
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.message_passing import PairLayer, others
+from ssmail.models.edge_layers import RELU, TANH, Activation, EdgeLayers
+from ssmail.models.graph_encoder import off_diagonal
+from ssmail.models.message_passing import PairLayer
 from ssmail.spec import VariationalSpec
 
 
 class PairPerceptron(nn.Module):
-    """act(W_2 act(W_s x_i + W_r x_j)) of every ordered pair: x (..., N, D) -> (..., N, N, H), sender first. The
-    activation may work in place.
-    """
+    """act(W_2 act(W_s x_i + W_r x_j)) for the edge from i to j."""
 
-    def __init__(self, inputs: int, hidden: int, activation: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, inputs: int, hidden: int, activation: Activation) -> None:
         super().__init__()
         self.first = PairLayer(inputs, hidden)
         self.second = nn.Linear(hidden, hidden)
         self.activation = activation
 
-    def forward(self, x: Tensor) -> Tensor:
-        """The diagonal, an agent with itself, is computed too and is for the caller to ignore."""
-        return self.activation(self.second(self.activation(self.first(x))))
+    def forward(self, x: Tensor, weights: Tensor) -> Tensor:
+        """x (B, T, N, D) and weights (B, T, N, N - 1), receiver by receiver -> the weighted sum over senders
+        (B, T, N, H).
+        """
+        sent, own = self.first.sender(x), self.first.receiver(x)
+        second = self.second.weight, self.second.bias
+        received: Tensor = EdgeLayers.apply(sent, own, None, None, *second, weights, self.activation)[1]  # type: ignore[no-untyped-call]  # torch's
+        return received
 
 
 class ActivatedMessages(nn.Module):
@@ -39,7 +42,7 @@ class ActivatedMessages(nn.Module):
     carries nothing.
     """
 
-    def __init__(self, inputs: int, spec: VariationalSpec, activation: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, inputs: int, spec: VariationalSpec, activation: Activation) -> None:
         super().__init__()
         self.skipped = int(spec.first_type_is_none)
         self.size = spec.decoder_hidden
@@ -48,14 +51,20 @@ class ActivatedMessages(nn.Module):
         )
 
     def weights(self, graph: Tensor) -> Tensor:
-        """(..., N, N, K) -> the weights of the messages of each type in the mean, (..., N, N, K or K - 1)."""
-        return graph[..., self.skipped :] * others(graph.shape[-2], graph)
+        """(B, T, N, N, K) -> the weights of the messages of each type in the mean, receiver by receiver,
+        (B, T, N, N - 1, K or K - 1).
+        """
+        n = graph.shape[2]
+        edges = off_diagonal(graph[..., self.skipped :].transpose(2, 3))
+        return edges.reshape(*edges.shape[:2], n, n - 1, edges.shape[-1]) / max(n - 1, 1)
 
     def forward(self, x: Tensor, weights: Tensor) -> Tensor:
-        """x (..., N, D) and weights (..., N, N, K or K - 1) -> (..., N, H)."""
+        """x (B, T, N, D) and weights (B, T, N, N - 1, K or K - 1) -> (B, T, N, H)."""
         received = x.new_zeros(*x.shape[:-1], self.size)
-        for kind, function in enumerate(self.types):
-            received = received + (function(x) * weights[..., kind : kind + 1]).sum(dim=-3)
+        if x.shape[2] == 1:
+            return received
+        for function, weight in zip(self.types, weights.expand(-1, x.shape[1], -1, -1, -1).unbind(-1), strict=True):
+            received = received + function(x, weight)
         return received
 
 
@@ -74,7 +83,7 @@ class MessageDecoder(nn.Module):
     def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.action_size = action_size
-        self.messages = ActivatedMessages(inputs, spec, torch.relu_)
+        self.messages = ActivatedMessages(inputs, spec, RELU)
         self.head = motion_head(inputs + spec.decoder_hidden, spec.decoder_hidden, action_size)
 
     def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, None]:
@@ -97,7 +106,7 @@ class RecurrentDecoder(nn.Module):
     def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.action_size, self.size = action_size, spec.decoder_hidden
-        self.messages = ActivatedMessages(self.size, spec, torch.tanh_)
+        self.messages = ActivatedMessages(self.size, spec, TANH)
         self.inputs = nn.Linear(inputs, 3 * self.size)
         self.received = nn.Linear(self.size, 3 * self.size, bias=False)
         self.head = motion_head(self.size, self.size, action_size)
@@ -111,15 +120,15 @@ class RecurrentDecoder(nn.Module):
         from_inputs = self.inputs(x)
         hidden = x.new_zeros(b, n, self.size) if memory is None else memory
         states = []
-        for inputs, weight in zip(from_inputs.unbind(1), weights.unbind(1), strict=True):
+        for inputs, weight in zip(from_inputs.unbind(1), torch.split(weights, 1, dim=1), strict=True):
             hidden = self._update(hidden, inputs, weight)
             states.append(hidden)
         a = self.action_size
         return x[..., a : 2 * a] + self.head(torch.stack(states, dim=1)), hidden
 
     def _update(self, hidden: Tensor, from_inputs: Tensor, weights: Tensor) -> Tensor:
-        """One step of the hidden states (B, N, H)."""
-        received = self.received(self.messages(hidden, weights))
+        """One step of the hidden states (B, N, H), given the weights (B, 1, N, N - 1, K or K - 1) of messages."""
+        received = self.received(self.messages(hidden.unsqueeze(1), weights).squeeze(1))
         gates = torch.sigmoid(from_inputs[..., : 2 * self.size] + received[..., : 2 * self.size])
         reset, update = gates.chunk(2, dim=-1)
         candidate = torch.tanh(from_inputs[..., 2 * self.size :] + reset * received[..., 2 * self.size :])

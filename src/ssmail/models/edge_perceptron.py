@@ -2,21 +2,18 @@
 Schwing 2020).
 
 An edge's perceptron reads [x_sender, x_receiver]. Its first layer is linear, so it is applied per node (see
-message_passing); the sender's half is repeated for each of its edges and the receiver's half is broadcast. Only the N *
-(N - 1) edges between different agents are there, receiver by receiver: axis -3 of an edge tensor (..., N, N - 1, H) is
-the receiver j, axis -2 its senders in order, j left out. So a mean over senders is a plain mean, and batch norm sees
-real edges only.
+message_passing); the rest is in edge_layers, which says how edges lie in memory. A mean over senders is a plain mean,
+and batch norm sees real edges only. Batch norm multiplies and adds, feature by feature, and what reads it begins with a
+linear layer or a mean: so edges are never normalised, but go on with the factors (ScaledEdges).
 """
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.edge_layers import ELU, EdgeLayers
 from ssmail.models.graph_encoder import on_diagonal
-
-
-def senders(agents: int, device: torch.device) -> Tensor:
-    """(N * (N - 1),) the sender of each edge, receiver by receiver."""
-    return torch.arange(agents, device=device).repeat(agents, 1)[~torch.eye(agents, dtype=torch.bool, device=device)]
 
 
 def edge_graph(edges: Tensor) -> Tensor:
@@ -32,6 +29,43 @@ class FeatureNorm(nn.BatchNorm1d):
     def forward(self, x: Tensor) -> Tensor:
         """(..., H) -> (..., H). Raises ValueError in training on a single vector, which has no variance."""
         return super().forward(x.flatten(0, -2)).view(x.shape) if x.numel() else x
+
+    def factors(self, mean: Tensor, variance: Tensor, count: int) -> tuple[Tensor, Tensor]:
+        """Scale and shift (H,) with which scale * x + shift is the norm of `count` vectors x of this mean and variance
+        (H,), biased; like forward it moves the running statistics in training and uses them in evaluation.
+        """
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+        if self.training:
+            self.num_batches_tracked += 1
+            self.running_mean.lerp_(mean.detach(), self.momentum)
+            self.running_var.lerp_(variance.detach() * (count / (count - 1)), self.momentum)
+        else:
+            mean, variance = self.running_mean, self.running_var
+        scale = self.weight * torch.rsqrt(variance + self.eps)
+        return scale, self.bias - mean * scale
+
+
+@dataclass(frozen=True)
+class ScaledEdges:
+    """Edges scale * values + shift: values (B, T, N, N - 1, H), their mean over senders (B, T, N, H), and scale and
+    shift (H,).
+    """
+
+    values: Tensor
+    means: Tensor
+    scale: Tensor
+    shift: Tensor
+
+    def tensor(self) -> Tensor:
+        """(B, T, N, N - 1, H)."""
+        return self.values * self.scale + self.shift
+
+    def received(self) -> Tensor:
+        """The mean over senders (B, T, N, H); zeros for a single agent."""
+        return self.means * self.scale + self.shift
 
 
 def elu(x: Tensor) -> Tensor:
@@ -72,12 +106,19 @@ class EdgePerceptron(nn.Module):
         self.second = nn.Linear(hidden, hidden)
         self.norm = norm_layer(hidden, batch_norm)
 
-    def forward(self, x: Tensor, edges: Tensor | None = None) -> Tensor:
+    def forward(self, x: Tensor, edges: ScaledEdges | None = None) -> ScaledEdges:
         """x (B, T, N, D) and, with edge_inputs, edges (B, T, N, N - 1, edge_inputs) -> (B, T, N, N - 1, H)."""
-        n = x.shape[2]
-        sent = self.sender(x).index_select(2, senders(n, x.device)).unflatten(2, (n, n - 1))
-        h = sent + self.receiver(x).unsqueeze(-2)
+        b, t, n, _ = x.shape
+        ones, zeros = torch.ones_like(self.second.bias), torch.zeros_like(self.second.bias)
+        if n == 1:
+            return ScaledEdges(x.new_zeros(b, t, 1, 0, len(ones)), x.new_zeros(b, t, 1, len(ones)), ones, zeros)
+        receiver, skip = self.receiver(x), None
         if self.edge is not None and edges is not None:
-            h = h + self.edge(edges)
-        out: Tensor = self.norm(elu(self.second(elu(h))))
-        return out
+            receiver = receiver + self.edge.weight @ edges.shift
+            skip = self.edge.weight * edges.scale
+        given = None if skip is None or edges is None else edges.values
+        second = self.second.weight, self.second.bias
+        values, means, variance = EdgeLayers.apply(self.sender(x), receiver, given, skip, *second, None, ELU)  # type: ignore[no-untyped-call]  # torch's
+        if not isinstance(self.norm, FeatureNorm):
+            return ScaledEdges(values, means, ones, zeros)
+        return ScaledEdges(values, means, *self.norm.factors(means.mean(dim=(0, 1, 2)), variance, b * t * n * (n - 1)))

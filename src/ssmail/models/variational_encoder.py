@@ -13,7 +13,9 @@ All logits are (B, T, N, N, K), sender first, and zero on the diagonal, where th
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron, edge_graph
+from ssmail.models.edge_layers import CHUNK
+from ssmail.models.edge_memory import both_ways
+from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron, ScaledEdges, edge_graph
 from ssmail.models.graph_encoder import Memory, remember
 from ssmail.spec import VariationalSpec
 
@@ -36,11 +38,10 @@ class EdgeEmbedding(nn.Module):
         self.nodes = NodePerceptron(hidden, hidden, batch_norm)
         self.edges_out = EdgePerceptron(hidden, hidden, batch_norm, edge_inputs=hidden)
 
-    def forward(self, x: Tensor) -> Tensor:
+    def forward(self, x: Tensor) -> ScaledEdges:
         """x (B, T, N, F) -> (B, T, N, N - 1, H), receiver by receiver."""
-        edges = self.edges_in(self.nodes_in(x))
-        nodes = self.nodes(edges.sum(dim=-2) / max(x.shape[-2] - 1, 1))
-        out: Tensor = self.edges_out(nodes, edges)
+        edges: ScaledEdges = self.edges_in(self.nodes_in(x))
+        out: ScaledEdges = self.edges_out(self.nodes(edges.received()), edges)
         return out
 
 
@@ -54,12 +55,13 @@ class StaticEncoder(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Observed steps x (B, T, N, F) -> posterior logits (B, 1, N, N, K)."""
-        return edge_graph(self.head(self.embedding(x).mean(dim=1, keepdim=True)))
+        edges: ScaledEdges = self.embedding(x)
+        return edge_graph(self.head(edges.values.sum(dim=1, keepdim=True) * (edges.scale / x.shape[1]) + edges.shift))
 
     def running(self, x: Tensor) -> Tensor:
         """(B, T, N, F) -> (B, T, N, N, K): for each step the logits given the steps up to it."""
         count = torch.arange(1, x.shape[1] + 1, dtype=x.dtype, device=x.device).view(1, -1, 1, 1, 1)
-        return edge_graph(self.head(self.embedding(x).cumsum(dim=1) / count))
+        return edge_graph(self.head(self.embedding(x).tensor().cumsum(dim=1) / count))
 
 
 class DynamicEncoder(nn.Module):
@@ -70,6 +72,7 @@ class DynamicEncoder(nn.Module):
         self.embedding = EdgeEmbedding(inputs, spec.hidden, spec.batch_norm)
         self.past = nn.LSTM(spec.hidden, spec.memory)
         self.future = nn.LSTM(spec.hidden, spec.memory)
+        self.head_size = spec.head
         self.prior_head = edge_type_head(spec.memory, spec)
         self.posterior_head = edge_type_head(2 * spec.memory, spec)
 
@@ -77,10 +80,8 @@ class DynamicEncoder(nn.Module):
         """x (B, T, N, F) -> the logits of the prior, which reads x[:, : t + 1] for step t, and of the posterior, which
         reads all of x; both (B, T, N, N, K).
         """
-        sequences = self._sequences(x)
-        past, _ = remember(self.past, sequences, None)
-        future = remember(self.future, sequences.flip(0), None)[0].flip(0)
-        both = torch.cat([past, future], dim=-1)
+        edges: ScaledEdges = self.embedding(x.transpose(0, 1))
+        past, both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
         return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
 
     def prior(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
@@ -88,16 +89,13 @@ class DynamicEncoder(nn.Module):
         and the memory after the last step. In evaluation mode any division into calls gives the same logits (in
         training mode batch norm depends on the steps that are read together).
         """
-        past, memory = remember(self.past, self._sequences(x), memory)
+        sequences = self.embedding(x.transpose(0, 1)).tensor().flatten(1, 3)
+        past, memory = remember(self.past, sequences, memory)
         return self._logits(self.prior_head, past, x), memory
-
-    def _sequences(self, x: Tensor) -> Tensor:
-        """The embeddings along each edge: (B, T, N, F) -> (T, B * N * (N - 1), H)."""
-        edges: Tensor = self.embedding(x)
-        return edges.transpose(0, 1).flatten(1, 3)
 
     def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:
         """(T, B * N * (N - 1), H) -> (B, T, N, N, K)."""
         b, t, n, _ = x.shape
-        logits: Tensor = head(sequences)
+        in_cache = max(CHUNK // (b * n * n * self.head_size), 1)
+        logits = torch.cat([head(steps) for steps in torch.split(sequences, in_cache)])
         return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))
