@@ -42,7 +42,7 @@ class Deaf:
     def draw_graph_noise(self, batch: int, steps: int, agents: int, generator: torch.Generator) -> Tensor:
         return torch.zeros(batch, 1, 1, 1, 2)
 
-    def encoder(self, x: Tensor) -> tuple[None, None]:
+    def encoder(self, x: Tensor, memory: None) -> tuple[None, None]:
         self.history = x
         return None, None
 
@@ -115,13 +115,17 @@ def acting(
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["clean", "noisy"])
-def test_the_encoder_remembers_what_was_observed_as_if_it_had_read_all_in_one_pass(noise: Tensor | None) -> None:
+@pytest.mark.parametrize("at_once", [10, 2])
+def test_the_encoder_remembers_what_was_observed_as_if_it_had_read_all_in_one_pass(
+    noise: Tensor | None, at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ssmail.training.rollout.READ_AT_ONCE", at_once)
     policy, made = acting(OBSERVED, noise)
     read = torch.cat([OBSERVED[:, :-1], made.states[:, :-1]], dim=1) + (0 if noise is None else noise)
     with torch.no_grad():
         expected = policy.encoder(read)[0][:, H - 1 :]
         forgetful = policy.encoder(read[:, H - 1 :])[0]  # negative control
-    torch.testing.assert_close(torch.cat(policy.kept, dim=1), expected)
+    torch.testing.assert_close(torch.cat(policy.kept[-STEPS:], dim=1), expected)
     assert not torch.allclose(expected, forgetful, atol=1e-3)
 
 

@@ -133,3 +133,19 @@ def test_nri_infers_its_graph_from_all_that_was_observed(monkeypatch: pytest.Mon
     made.predictor.free_run(observed, 3, torch.Generator(), noise=noise)
     assert len(seen) == 1
     assert torch.equal(seen[0], observed + noise[:, :6])
+
+
+@pytest.mark.parametrize("method", ["nri", "dnri"])
+def test_predictions_in_parts_are_those_of_all_at_once(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts of two of five trajectories and noise of their own; parts that share what is drawn would differ."""
+    made = learner(method, "variational.decoder=recurrent")
+    observed = made.setting.experts.states[:5, :6]
+    added = 0.1 * torch.randn(5, 8, *observed.shape[2:], generator=torch.Generator().manual_seed(1))
+    found = []
+    for at_once in (16, 2):
+        monkeypatch.setattr("ssmail.training.variational.AT_ONCE", at_once)
+        draw = torch.Generator().manual_seed(0)
+        found.append((made.predictor.free_run(observed, 3, draw, noise=added), made.predictor.one_step(observed, draw)))
+    for whole, parts in zip(*found, strict=True):
+        torch.testing.assert_close(parts, whole)
+        assert not torch.allclose(whole[:1].expand_as(whole), whole)

@@ -10,6 +10,8 @@ from ssmail.models.features import Features
 from ssmail.models.graph_encoder import Memory
 from ssmail.models.policy import GraphPolicy
 
+READ_AT_ONCE = 10  # observed steps: with the edges of recorded motion all of them together are gigabytes
+
 
 @dataclass(frozen=True)
 class Rollout:
@@ -53,8 +55,9 @@ def rollout(
         noise = observed.new_zeros(1, h + steps - 1, 1, 1)
     start = observed[:, 0] + noise[:, 0]
     memory: Memory | None = None
-    if h > 1:
-        _, memory = policy.encoder(features(observed[:, :-1] + noise[:, : h - 1], start))
+    for first in range(0, h - 1, READ_AT_ONCE):
+        part = slice(first, min(first + READ_AT_ONCE, h - 1))
+        _, memory = policy.encoder(features(observed[:, part] + noise[:, part], start, first), memory)
     state = observed[:, -1:]
     states, actions = [], []
     for t in range(steps):

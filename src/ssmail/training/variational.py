@@ -2,10 +2,11 @@
 (Kipf et al. 2018; Graber and Schwing 2020).
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -22,6 +23,8 @@ from ssmail.training.curricula import curriculum_metrics, draw_interventions, in
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.updates import clipped_step, mean_of, with_noise
+
+AT_ONCE = 16  # trajectories that are predicted together
 
 
 class VariationalModel(nn.Module):
@@ -87,6 +90,13 @@ def evaluation_mode(model: nn.Module) -> Iterator[None]:
         model.train(was_training)
 
 
+def in_parts(function: Callable[..., Tensor], *given: Tensor) -> Tensor:
+    """function(*given) for tensors (B, ...), AT_ONCE trajectories at a time: the 930 edges of recorded motion times the
+    steps of a long history are gigabytes otherwise.
+    """
+    return torch.cat([function(*part) for part in zip(*(torch.split(x, AT_ONCE) for x in given), strict=True)])
+
+
 class _Graphs:
     """The sampled graphs of a prediction, step after step: nri's one, or dnri's from the prior and its memory."""
 
@@ -129,18 +139,22 @@ class VariationalPredictor:
             b, h, n, _ = observed.shape
             noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
             gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (not deterministic)
-            graphs = _Graphs(self.model, observed + noise[:, :h], gumbel)
-            memory: Tensor | None = None
-            if h > 1:
-                past = observed[:, :-1] + noise[:, : h - 1]
-                _, memory = self.model.decode(past, graphs.of(past))
-            state = observed[:, -1:]
-            states = [state]
-            for t in range(h - 1, h - 1 + steps):
-                read = state + noise[:, t : t + 1]
-                action, memory = self.model.decode(read, graphs.of(read), memory)
-                state = self.integrator.step(state, action)
-                states.append(state)
+            return in_parts(partial(self._free_run, steps), observed, noise.expand(b, -1, -1, -1), gumbel)
+
+    def _free_run(self, steps: int, observed: Tensor, noise: Tensor, gumbel: Tensor) -> Tensor:
+        h = observed.shape[1]
+        graphs = _Graphs(self.model, observed + noise[:, :h], gumbel)
+        memory: Tensor | None = None
+        if h > 1:
+            past = observed[:, :-1] + noise[:, : h - 1]
+            _, memory = self.model.decode(past, graphs.of(past))
+        state = observed[:, -1:]
+        states = [state]
+        for t in range(h - 1, h - 1 + steps):
+            read = state + noise[:, t : t + 1]
+            action, memory = self.model.decode(read, graphs.of(read), memory)
+            state = self.integrator.step(state, action)
+            states.append(state)
         return torch.cat(states, dim=1)
 
     @torch.no_grad()
@@ -149,9 +163,11 @@ class VariationalPredictor:
         now = states[:, :-1]
         noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
         with evaluation_mode(self.model):
-            graphs = self.model.sample(self.model.past_logits(now), noise)
-            action, _ = self.model.decode(now, graphs)
-        return self.integrator.step(now, action)
+            return in_parts(self._one_step, now, noise)
+
+    def _one_step(self, now: Tensor, noise: Tensor) -> Tensor:
+        graphs = self.model.sample(self.model.past_logits(now), noise)
+        return self.integrator.step(now, self.model.decode(now, graphs)[0])
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "VariationalPredictor":
         return VariationalPredictor(deepcopy(self.model, memo), self.integrator)
