@@ -1,5 +1,6 @@
 """Figure 7: errors over predicted steps and their slopes, by hand; and that picture and CSV show the record."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -189,6 +190,18 @@ def test_a_run_far_above_the_others_does_not_flatten_them(store: Store, runs: li
     assert fig7_noise.draw(record).axes[0].get_ylim()[1] == clean.end
     assert "clean: dnri: 1 of the runs rise above 0.112, where the scale ends." in record.notes
     assert record.table()["value"].max() == 3 * 100 * 4
+
+
+def test_a_reference_far_above_the_methods_does_not_flatten_them(store: Store, runs: list[str]) -> None:
+    """With noise constant velocity can be a hundred times worse; then it is told, and does not set the scale."""
+    panel = fig7_noise.collect(store).panels[1]
+    assert not panel.reference_leaves
+    far = replace(panel, reference=1000 * panel.reference)
+    assert far.reference_leaves
+    assert far.end == replace(panel, reference=panel.reference[:0]).end < far.reference.max()
+    highest = far.reference.max()
+    told = f"noisy: constant velocity rises to {highest:.3g}, beyond {far.end:.3g}, where the scale ends."
+    assert fig7_noise._panel_notes(far)[0] == told
 
 
 def test_runs_that_were_tested_in_different_ways_are_not_compared(store: Store, add_forecast: Any) -> None:

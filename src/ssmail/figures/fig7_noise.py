@@ -44,6 +44,7 @@ NAME = "fig7"
 CONDITIONS = {"clean": "", "noisy": "_noisy"}  # what is told of the input -> the end of the arrays' prefixes
 METRIC = "test/mse"
 REACH = 4.0
+REFERENCE_REACH = 8.0
 
 Floats = npt.NDArray[np.float64]
 
@@ -73,11 +74,25 @@ class Panel:
 
     @property
     def end(self) -> float:
-        """Where the scale ends: a little above the highest run, but within REACH times the largest typical error."""
-        peaks = [[values.max() for curve in shown.curves if len(values := _finite(curve))] for shown in self.bands]
-        typical = [*self.reference, *(np.median(found) for found in peaks if found)]
-        highest = [*self.reference, *(peak for found in peaks for peak in found)]
+        """Where the scale ends: a little above the highest run and the reference, but within REACH times the largest
+        typical error; a reference that leaves the methods on the ground does not count.
+        """
+        typical, highest = [float(np.median(peaks)) for peaks in self._peaks], [max(peaks) for peaks in self._peaks]
+        if not self.reference_leaves:
+            typical, highest = [*typical, *self.reference], [*highest, *self.reference]
         return float(min(1.05 * max(highest, default=0), REACH * max(typical, default=0))) or 1.0
+
+    @property
+    def reference_leaves(self) -> bool:
+        """Whether constant velocity is so much worse than the methods that it is shown as far as the scale goes."""
+        typical = max((float(np.median(peaks)) for peaks in self._peaks), default=0.0)
+        return typical > 0 and max(self.reference, default=0) > REFERENCE_REACH * typical
+
+    @property
+    def _peaks(self) -> list[list[float]]:
+        """The highest error of each run of each method that has one."""
+        found = [[float(v.max()) for curve in shown.curves if len(v := _finite(curve))] for shown in self.bands]
+        return [peaks for peaks in found if peaks]
 
     def rows(self, statistic: Statistic) -> Iterator[tuple[object, ...]]:
         """Rows of NoiseRecord.table."""
@@ -199,6 +214,9 @@ def _first_of_slope(steps: int) -> int:
 
 def _panel_notes(panel: Panel) -> list[str]:
     notes = [f"{panel.condition}: {note}" for note in curve_notes.high(panel.bands, panel.end)]
+    if panel.reference_leaves:
+        where = f"rises to {max(panel.reference):.3g}, beyond {panel.end:.3g}, where the scale ends"
+        notes.append(f"{panel.condition}: constant velocity {where}.")
     if panel.steps < 2:
         return notes
     told = [f"{shown.label} {_told(slopes)}" for shown, slopes in zip(panel.bands, panel.slopes, strict=True)]
