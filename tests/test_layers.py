@@ -19,6 +19,7 @@ FLOORS = (
     ("execution",),
     ("figures",),
     ("evidence",),
+    ("report",),
     ("ssmail_cli",),
 )
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}

@@ -10,7 +10,7 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
-from ssmail_cli import ablate, claims, data, db, explain, mocap, plot, reproduce, runs, train
+from ssmail_cli import ablate, claims, data, db, explain, mocap, plot, report, reproduce, runs, train
 from ssmail_cli.display import complaint
 
 INTERRUPTED = 130
@@ -31,6 +31,7 @@ app.command("ablate")(ablate.ablate)
 app.command("ablate-alpha")(ablate.alias("alpha"))
 app.command("ablate-beta")(ablate.alias("beta"))
 app.command("reproduce")(reproduce.reproduce)
+app.command("report")(report.report)
 app.command("plot")(plot.plot)
 app.command("claims")(claims.claims)
 app.command("explain")(explain.explain)

@@ -1,40 +1,59 @@
-"""`ssmail reproduce`: every run that figures of the paper need, in one sweep, and then the figures."""
+"""`ssmail reproduce`: the runs that figures and claims of the paper need, in one sweep; then figures and report."""
 
-import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from ssmail.errors import InputError
+from ssmail.report.wording import duration
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
 from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
-from ssmail_cli.progress import Sweep
-from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows
+from ssmail_cli.progress import Sweep, label
+from ssmail_cli.report import draw_or_tell, undrawn, write_report
+from ssmail_cli.reproduction_data import DataFiles, look_for_data, make_data, settled_runs, tell
+from ssmail_cli.sweep import SOME_RUNS_FAILED, Rows, compute, finish, is_interrupted, plan, result_rows
 from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
     from ssmail.execution.local import Cell
+    from ssmail.report.drawing import Drawn
     from ssmail.spec import RunSpec
-    from ssmail.store import Store
+    from ssmail.store import RunRow, Store
 
 FAILURE = 1
+SEEDS, FEWER_SEEDS = "0-4", {"smoke": "0-1"}  # with which a smoke ends within five minutes on two cores
 PLAN_COLUMNS = {"figure": "figure", "runs": "runs", "stored": "stored", "new": "new", "time": "time"}
 
 
 def reproduce(
     only: Annotated[
         str | None,
-        typer.Option("--only", metavar="FIGURE[,FIGURE...]", help="These figures alone.", show_default="all of them"),
+        typer.Option(
+            "--only", metavar="FIGURE[,FIGURE...]", help="These figures alone, no report.", show_default="all of them"
+        ),
     ] = None,
     profile: options.ProfileName = "quick",
-    seeds: options.Seeds = "0-4",
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            "--seeds", help="Seeds, one run each: 0-4, or 0,2,5, or 0-2,7.", show_default="0-4; of profile smoke 0-1"
+        ),
+    ] = None,
     jobs: options.Jobs = 2,
     device: options.DeviceOption = Device.AUTO,
+    cmu: Annotated[
+        Path | None,
+        typer.Option(
+            "--cmu-dir",
+            envvar="SSMAIL_CMU_DIR",
+            help="Folder or zip file with 35.asf and 35_01.amc ...: makes data/mocap.npz when it is not there.",
+        ),
+    ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print how many runs there are to train and how long that may take.")
     ] = False,
@@ -51,33 +70,63 @@ def reproduce(
     ] = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
-    """Train what figures of the paper need, and draw them.
+    """Train what the figures and claims of the paper need, draw the figures, and write the report.
 
-    Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed. A run that fails stops
-    neither the others nor the figures. Prints the paths of the files.
+    Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: the same command goes
+    on where it was stopped or killed. A run that fails stops neither the others nor the figures. report.md and
+    report.html go beside the folder of the figures; with --only there is none, and `ssmail report` writes it of all
+    that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
+    paths of the files. Exit code 3: some runs did not finish, or figures were left out.
     """
     from ssmail.execution.cells import check_labels
     from ssmail.execution.figure_cells import longest_first
     from ssmail.store import Store
 
     check_formats(formats or [])
-    chosen_seeds = parse_seeds(seeds)
-    figures = _figures(only, profile, chosen_seeds)
+    given = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
+    figures = _figures(only, profile, parse_seeds(given))
     statistic = parse_statistic(stat, list(figures))
-    needed = _merged(figures.values())
-    seconds = _seconds(needed, db)
+    data = look_for_data(figures, cmu)
+    if only is not None and set(data.missing) == set(figures):
+        raise InputError(f"{next(iter(data.missing.values()))}.")
+    tell(data)
+    trained = {name: cells for name, cells in figures.items() if name not in data.missing}
+    needed = _merged(trained.values())
+    seconds = _seconds(_merged(figures.values()), db)
     if dry_run:
-        _print_plan(figures, seconds, db, jobs, as_json)
+        _print_plan(figures, data, seconds, db, jobs, as_json)
         return
     sweep = {cell: needed[cell] for cell in longest_first(list(needed), seconds)}
     chosen_device = pick_device(device)
     check_labels(sweep)
+    make_data(figures, data, cmu)
     store = Store.open(db)
+    _wait(store, sweep)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, ResumeChoice.AUTO, chosen_device))
-    drawn = is_interrupted(rows) or _draw(store, figures, sweep, rows, statistic, out, formats or ["png"])
+    if is_interrupted(rows):
+        finish(sweep, rows)
+    ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
+    ended |= settled_runs(store, _merged(figures[name] for name in data.missing))
+    drawn = [
+        _draw(store, name, cells, ended, data.missing.get(name), statistic, out, formats or ["png"])
+        for name, cells in figures.items()
+    ]
+    written = only is not None or _report(store, drawn, out, db, profile, given, sweep, rows)
     finish(sweep, rows)
-    if not drawn:
+    if not written or any(figure.lacks for figure in drawn if figure.name not in data.missing):
         raise typer.Exit(FAILURE)
+    if data.missing:
+        raise typer.Exit(SOME_RUNS_FAILED)
+
+
+def _wait(store: "Store", sweep: Sweep) -> None:
+    """Let the processes of a reproduction that was killed a moment ago come to their end."""
+    from ssmail.execution.waiting import wait_for_others
+
+    def on_wait(run: "RunRow") -> None:
+        note(f"waiting up to half a minute for another process, at work or killed lately, to leave run {run.name}")
+
+    wait_for_others(store, sweep, on_wait)
 
 
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
@@ -115,17 +164,36 @@ def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
 
 
 def _print_plan(
-    figures: dict[str, Sweep], seconds: "dict[RunSpec, float | None]", db: str, jobs: int, as_json: bool
+    figures: Mapping[str, Sweep],
+    data: DataFiles,
+    seconds: "Mapping[RunSpec, float | None]",
+    db: str,
+    jobs: int,
+    as_json: bool,
 ) -> None:
     """Print a row for each figure, as if it were alone, and one for all of them, in which shared runs count once."""
-    every = _merged(figures.values())
-    actions = plan(every, db, ResumeChoice.AUTO)
     rows = []
-    for name, sweep in {**figures, "total": every}.items():
-        new = [cell for cell in sweep if actions[cell][0] != "skip"]
+    trained = _merged(cells for name, cells in figures.items() if name not in data.missing)
+    stored = _stored(_merged(figures.values()), data, db)
+    for name, sweep in {**figures, "total": trained}.items():
+        new = [cell for cell in sweep if cell not in stored]
         row = {"figure": name, "runs": len(sweep), "stored": len(sweep) - len(new), "new": len(new)}
-        rows.append(row | _time([seconds[cell.spec] for cell in new], jobs))
+        if name in data.missing:
+            rows.append(row | {"new": 0, "seconds": None, "time": "left out"})
+        else:
+            rows.append(row | _time([seconds[cell.spec] for cell in new], jobs))
     print_rows(rows, PLAN_COLUMNS, chosen_format(as_json, None))
+
+
+def _stored(sweep: Sweep, data: DataFiles, db: str) -> "set[Cell]":
+    """The cells that need not be computed. Those whose data is not there cannot be compared with it."""
+    from ssmail.store import Store
+
+    if is_missing(db):
+        return set()
+    if data.made or data.missing:
+        return set(settled_runs(Store.open(db), sweep))
+    return {cell for cell, (action, _) in plan(sweep, db, ResumeChoice.AUTO).items() if action == "skip"}
 
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
@@ -139,46 +207,45 @@ def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     return {"seconds": None, "time": f"more than {duration(total)}" if known else "unknown"}
 
 
-def duration(seconds: float) -> str:
-    """ "40 s", "12 min" or "2 h 5 min"."""
-    if seconds < 90:
-        return f"{math.ceil(seconds)} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
-
-
 def _draw(
     store: "Store",
-    figures: dict[str, Sweep],
-    sweep: Sweep,
-    rows: Rows,
+    name: str,
+    cells: Sweep,
+    ended: "Mapping[Cell, str]",
+    missing: str | None,
     statistic: "Statistic | None",
     out: Path,
     formats: Sequence[str],
-) -> bool:
-    """Save each figure from its own runs, as far as they ended, and print the paths; whether all could be drawn."""
-    from ssmail.figures import FIGURES, save
-
-    ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
-    complete = True
-    for name, cells in figures.items():
-        try:
-            record = FIGURES[name].collect(store, _ids(name, cells, ended), statistic=statistic)
-            for remark in record.notes:
-                note(f"{name}: {remark}")
-            for path in save(name, record, FIGURES[name].draw(record), out, formats):
-                typer.echo(path)
-        except Exception as error:  # hours of training shall not end without the other figures
-            note(f"{name} is not drawn: {complaint(error)}")
-            complete = False
-    return complete
-
-
-def _ids(name: str, cells: Sweep, ended: "dict[Cell, str]") -> list[str]:
-    """The runs that the figure is drawn from."""
+) -> "Drawn":
+    """The figure from its own runs, as far as they ended. missing: what its data lacks, so that none was trained."""
     ids = [ended[cell] for cell in cells if cell in ended]
     if not ids:
-        raise InputError("none of its runs finished.")
+        return undrawn(name, f"{missing}." if missing else "none of its runs finished.")
     if len(ids) < len(cells):
         note(f"{name}: {len(cells) - len(ids)} of its {len(cells)} runs are missing: not finished.")
-    return ids
+    return draw_or_tell(name, store, ids, out, formats, None, statistic)
+
+
+def _report(
+    store: "Store",
+    figures: "Sequence[Drawn]",
+    out: Path,
+    db: str,
+    profile: str,
+    seeds: str,
+    sweep: Sweep,
+    rows: Rows,
+) -> bool:
+    """Write the report; whether it could be written."""
+    unfinished = [
+        f"{label(names)} {row['outcome']}: {row['message']}"
+        for names, row in zip(sweep.values(), rows, strict=True)
+        if row["state"] != "finished"
+    ]
+    command = f"ssmail reproduce --profile {profile} --seeds {seeds} --db {db}"
+    try:
+        write_report(store, figures, out, command, profile, unfinished)
+    except Exception as error:  # the figures are there
+        note(f"the report is not written: {complaint(error)}")
+        return False
+    return True

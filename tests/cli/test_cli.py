@@ -40,6 +40,7 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "ablate-alpha",
         "ablate-beta",
         "reproduce",
+        "report",
         "plot",
         "claims",
         "explain",

@@ -7,13 +7,30 @@ from typing import Any
 
 import pytest
 
+from ssmail.evidence.collectors import COLLECTORS
 from ssmail.execution.figure_cells import figure_cells
 from ssmail.figures import FIGURES, provenance
 from ssmail.store import Store
-from ssmail_cli.reproduce import duration
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
+from tests.data.mocap.handmade import write_subject
+from tests.figures.handmade_arrays import forecasts
 
 SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
+LEFT_OUT = (
+    "is left out: there is no data/mocap.npz; `ssmail prep-mocap --source DIR --out data/mocap.npz` makes it of files "
+    "of the CMU database, and --download fetches those (or give --cmu-dir DIR)."
+)
+
+
+@pytest.fixture(autouse=True)
+def walking(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to work in, where a set of recorded walking seems to be; nothing reads it here."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SSMAIL_CMU_DIR", raising=False)
+    path = tmp_path / "data" / "mocap.npz"
+    path.parent.mkdir()
+    path.touch()
+    return path
 
 
 def plan(outcome: Outcome) -> dict[str, tuple[int, int, int]]:
@@ -42,8 +59,8 @@ def test_shared_cells_are_planned_once(cli: CommandLine, db: Path) -> None:
 def test_without_only_every_figure_is_planned(cli: CommandLine, db: Path) -> None:
     figures = plan(cli(*SMOKE, "--dry-run", "--db", db))
     listed = dict.fromkeys(module.name for module in FIGURES.values())
-    assert set(figures) <= {*listed, "total"}
-    assert {"fig4", "fig5", "fig9"} < set(figures)
+    assert set(figures) == {*listed, "total"}
+    assert {collector.claim.figure for collector in COLLECTORS} < set(listed)  # so the claims' runs are among them
     cells = {cell for name in figures if name != "total" for cell in figure_cells(name, "smoke", [0, 1])}
     assert figures["total"] == (len(cells), 0, len(cells))
     assert len(cells) < sum(runs for name, (runs, _, _) in figures.items() if name != "total")
@@ -67,14 +84,6 @@ def test_a_dry_run_counts_what_is_stored_and_judges_the_time_by_it(
     assert rows()["fig9"] == (0, 0.0, "none")
 
 
-@pytest.mark.parametrize(
-    ("seconds", "words"),
-    [(0.2, "1 s"), (89, "89 s"), (90, "2 min"), (2999, "50 min"), (5399, "1 h 30 min"), (7500, "2 h 5 min")],
-)
-def test_durations(seconds: float, words: str) -> None:
-    assert duration(seconds) == words
-
-
 def test_figures_are_drawn_from_their_runs_alone(
     cli: CommandLine, fake: FakeTraining, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,7 +94,9 @@ def test_figures_are_drawn_from_their_runs_alone(
     outcome = cli(*SMOKE, "--format", "svg", "--format", "png", "--out", out, "--db", db)
     assert outcome.code == 0
     names = [f"{FIGURES[name].stem}{suffix}" for name in ("fig4", "fig9") for suffix in (".svg", ".png", ".csv")]
-    assert [Path(line) for line in outcome.out.splitlines()] == [out / name for name in names]
+    pages = [tmp_path / "report.md", tmp_path / "report.html"]
+    assert [Path(line) for line in outcome.out.splitlines()] == [*(out / name for name in names), *pages]
+    assert all(page.exists() for page in pages)
     assert [cell.seed for cell in given["cells"]] == [0, 1]
     assert given["jobs"] == 2
     assert set(provenance.read(out / "fig4_stability.png").run_ids) == {run.id for run in Store.open(db).runs()[-2:]}
@@ -136,6 +147,9 @@ def test_a_run_that_fails_stops_nothing_else(
     outcome = cli(*SMOKE, "--out", tmp_path / "figures", "--db", db)
     assert (outcome.code, (tmp_path / "figures" / "fig4_stability.png").exists()) == (code, drawn)
     assert words in outcome.err.splitlines()[-1]
+    page = tmp_path / "report.html"
+    assert page.exists() == (code == 3)
+    assert code != 3 or (words in page.read_text()) == (0 in ends or 1 in ends)
     assert ("fig4: 1 of its 2 runs are missing: not finished." in outcome.err) == (ends == {1: "failed"})
     assert ("fig4 is not drawn: none of its runs finished." in outcome.err) == (not drawn and code == 3)
 
@@ -176,3 +190,93 @@ def test_a_second_call_computes_only_what_is_missing(
     assert set(begun) == {"wail, seed 0: started", "wail, seed 1: started", "ssail, seed 1: resumed after epoch 0"}
     assert [run.state for run in Store.open(db).runs()] == ["finished"] * 6
     assert plan(cli(*SMOKE, "--dry-run", "--db", db))["total"] == (6, 6, 0)
+
+
+def test_without_recorded_walking_its_figures_are_left_out_before_anything_is_trained(
+    cli: CommandLine, fake: FakeTraining, walking: Path, db: Path, tmp_path: Path
+) -> None:
+    walking.unlink()
+    outcome = cli(*SMOKE, "--only", "fig7,fig9,fig8", "--dry-run", "--db", db)
+    assert plan(outcome) == {"fig7": (4, 0, 0), "fig9": (2, 0, 2), "fig8": (4, 0, 0), "total": (2, 0, 2)}
+    assert outcome.err.splitlines() == [f"fig7 {LEFT_OUT}", f"fig8 {LEFT_OUT}"]
+    given = fake()
+    outcome = cli(*SMOKE, "--only", "fig7,fig9", "--out", tmp_path / "figures", "--db", db)
+    assert outcome.code == 3
+    assert {cell.spec.environment for cell in given["cells"]} == {"yjunction"}
+    assert outcome.err.splitlines()[0] == f"fig7 {LEFT_OUT}"
+    assert "fig7 is not drawn: there is no data/mocap.npz; `ssmail prep-mocap" in outcome.err
+    assert [Path(line).stem for line in outcome.out.splitlines()] == ["fig9_yjunction"] * 2
+    assert cli(*SMOKE, "--only", "fig7", "--db", db).sentence.startswith("there is no data/mocap.npz; `ssmail prep-")
+
+
+def test_stored_runs_are_drawn_without_their_data(
+    cli: CommandLine, fake: FakeTraining, walking: Path, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tests.cli.conftest.arrays", lambda _: forecasts(0.01))
+    fake()
+    assert cli(*SMOKE, "--only", "fig7", "--out", tmp_path / "figures", "--db", db).code == 0
+    walking.unlink()
+    given = fake()
+    outcome = cli(*SMOKE, "--only", "fig7,fig9", "--out", tmp_path / "again", "--db", db)
+    assert {cell.spec.environment for cell in given["cells"]} == {"yjunction"}
+    assert (tmp_path / "again" / "fig7_noise.csv").exists(), outcome.err
+
+
+def test_recorded_walking_is_made_of_the_files_that_are_named(
+    cli: CommandLine, fake: FakeTraining, walking: Path, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walking.unlink()
+    seen: list[bool] = []
+    folder = write_subject(tmp_path / "cmu", dict.fromkeys((*range(1, 17), *range(28, 35)), 110))
+    monkeypatch.setenv("SSMAIL_CMU_DIR", str(folder))
+    outcome = cli(*SMOKE, "--only", "fig7", "--dry-run", "--db", db)
+    assert plan(outcome)["fig7"] == (4, 0, 4)
+    assert outcome.err == f"data/mocap.npz is made from {folder}\n"
+    assert not walking.exists()
+    monkeypatch.setattr("ssmail_cli.reproduce.compute", lambda *_: seen.append(walking.exists()) or [])
+    monkeypatch.setattr("ssmail_cli.reproduce.result_rows", lambda *_: [{"outcome": "interrupted"}])
+    outcome = cli(*SMOKE, "--only", "fig7", "--db", db)
+    assert (seen, outcome.code, outcome.out) == ([True], 130, "")
+    assert "wrote data/mocap.npz" in outcome.err
+    monkeypatch.setenv("SSMAIL_CMU_DIR", "absent")
+    walking.unlink()
+    assert cli(*SMOKE, "--only", "fig7", "--db", db).sentence.startswith("there is no absent; --cmu-dir (or SSMAIL_CMU")
+
+
+def test_a_smoke_has_fewer_seeds_by_default(cli: CommandLine, db: Path) -> None:
+    for profile, seeds in (("smoke", 2), ("quick", 5)):
+        planned = plan(cli("reproduce", "--profile", profile, "--dry-run", "--only", "fig9", "--db", db))
+        assert planned["fig9"] == (seeds, 0, seeds)
+
+
+def test_a_report_that_cannot_be_written_loses_no_figure(
+    cli: CommandLine, fake: FakeTraining, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs(monkeypatch, tmp_path, fig4=["ssail"])
+    fake()
+    monkeypatch.setattr("ssmail_cli.reproduce.write_report", lambda *_: 1 / 0)
+    outcome = cli(*SMOKE, "--out", tmp_path / "figures", "--db", db)
+    assert outcome.code == 1
+    assert (tmp_path / "figures" / "fig4_stability.png").exists()
+    assert "the report is not written: unexpected ZeroDivisionError" in outcome.err
+
+
+def test_the_report_is_written_again_from_the_store(
+    cli: CommandLine, fake: FakeTraining, db: Path, tmp_path: Path
+) -> None:
+    fake()
+    assert cli(*SMOKE, "--only", "fig4,fig9", "--out", tmp_path / "figures", "--db", db).code == 0
+    assert not (tmp_path / "report.html").exists()
+    before = Store.open(db).runs()
+    outcome = cli("report", "--out", tmp_path / "figures", "--format", "svg", "--db", db)
+    assert outcome.code == 3  # the other figures have no runs
+    assert Store.open(db).runs() == before
+    assert [Path(line).name for line in outcome.out.splitlines()][-2:] == ["report.md", "report.html"]
+    assert "](figures/fig4_stability.svg)" in (tmp_path / "report.md").read_text()
+    page = (tmp_path / "report.html").read_text()
+    drawn = {Path(line).stem for line in outcome.out.splitlines() if line.endswith(".svg")}
+    assert {"fig4_stability", "fig9_yjunction"} <= drawn
+    assert page.count("data:image/png;base64,") == len(drawn) == 9 - page.count("<strong>Not drawn:</strong>")
+    assert all(f'id="run-{run.name}"' in page for run in before)
+    assert "fig7 is not drawn: " in outcome.err
+    assert cli("report", "--db", tmp_path / "absent.db").sentence.startswith("there is no database")

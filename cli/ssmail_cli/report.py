@@ -1,0 +1,104 @@
+"""`ssmail report`: figures and verdicts of the stored runs as a report; and what `ssmail reproduce` ends with."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ssmail_cli.display import complaint, note
+from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, check_formats, parse_statistic
+from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
+
+if TYPE_CHECKING:
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.report.drawing import Drawn
+    from ssmail.store import Store
+
+INCOMPLETE = 3
+
+
+def report(
+    profile: Annotated[
+        str | None,
+        typer.Option("--profile", help="Runs of this profile.", show_default="the one that each figure draws"),
+    ] = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = None,
+    stat: Annotated[
+        str | None,
+        typer.Option(
+            "--stat",
+            help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
+            show_default="mean-std",
+        ),
+    ] = None,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Write the report of the stored runs: verdicts, figures, and the runs behind them. Nothing is trained.
+
+    Draws every figure whose runs are stored into --out, and beside that folder writes report.md and report.html, one
+    page without any other file. Prints the paths. Exit code 3: a figure could not be drawn; the report says why.
+    """
+    from ssmail.figures import FIGURES
+
+    check_formats(formats or [])
+    statistic = parse_statistic(stat, [ALL])
+    store = open_store(db)
+    figures = [
+        draw_or_tell(name, store, None, out, formats or ["png"], profile, statistic)
+        for name in dict.fromkeys(module.name for module in FIGURES.values())
+    ]
+    command = f"ssmail report --db {db}" + (f" --profile {profile}" if profile else "")
+    write_report(store, figures, out, command, profile)
+    if any(drawn.lacks for drawn in figures):
+        raise typer.Exit(INCOMPLETE)
+
+
+def draw_or_tell(
+    name: str,
+    store: "Store",
+    runs: Sequence[str] | None,
+    out: Path,
+    formats: Sequence[str],
+    profile: str | None,
+    statistic: "Statistic | None",
+) -> "Drawn":
+    """The figure, with its notes on stderr and its paths on stdout; or, with a line on stderr, why it is not drawn."""
+    from ssmail.report.drawing import draw
+
+    try:
+        drawn = draw(name, store, runs, out, formats, profile=profile, statistic=statistic)
+    except Exception as error:  # the other figures are to be drawn whatever is wrong with this one
+        return undrawn(name, complaint(error).removeprefix(f"{name} has nothing to draw: "))
+    for remark in drawn.notes:
+        note(f"{name}: {remark}")
+    for path in drawn.files:
+        typer.echo(path)
+    return drawn
+
+
+def undrawn(name: str, reason: str) -> "Drawn":
+    """A figure that is not drawn, which is told on stderr."""
+    from ssmail.report.drawing import Drawn
+
+    note(f"{name} is not drawn: {reason}")
+    return Drawn(name, lacks=reason)
+
+
+def write_report(
+    store: "Store",
+    figures: "Sequence[Drawn]",
+    out: Path,
+    command: str,
+    profile: str | None,
+    unfinished: Sequence[str] = (),
+) -> None:
+    """Judge the claims and write report.md and report.html beside the folder of the figures; print their paths."""
+    from ssmail.evidence import judge
+    from ssmail.report.contents import gather
+    from ssmail.report.pages import write
+
+    contents = gather(store, figures, judge(store, profile), command, unfinished)
+    for path in write(contents, out.parent):
+        typer.echo(path)

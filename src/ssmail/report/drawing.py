@@ -1,0 +1,76 @@
+"""One figure, saved to its files, with what the report shows of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ssmail.evaluation.statistics import Statistic
+from ssmail.figures import FIGURES, save
+from ssmail.figures.provenance import Provenance
+from ssmail.store import Store
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+SHOWN = 250  # dots per inch of a picture that is in the report alone
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure: its `files` (the CSV last), `image` (a PNG), `provenance` and `notes`, or why it `lacks` all this."""
+
+    name: str
+    files: tuple[Path, ...] = ()
+    image: bytes = b""
+    provenance: Provenance | None = None
+    notes: tuple[str, ...] = ()
+    lacks: str = ""
+
+    @property
+    def alias(self) -> str:
+        """What else it is called."""
+        return FIGURES[self.name].alias
+
+    @property
+    def summary(self) -> str:
+        """What it shows, in a line."""
+        return FIGURES[self.name].summary
+
+
+def draw(
+    name: str,
+    store: Store,
+    runs: Sequence[str] | None,
+    out: Path,
+    formats: Sequence[str],
+    *,
+    profile: str | None = None,
+    statistic: Statistic | None = None,
+) -> Drawn:
+    """Collect, draw and save the figure `name` ("fig4") of these runs (ids), or of those that it chooses by itself.
+
+    Raises what the figure's `collect` and `ssmail.figures.save` raise.
+    """
+    from ssmail.figures.saving import embedded
+
+    module = FIGURES[name]
+    record = module.collect(store, runs, profile=profile, statistic=statistic)
+    figure = module.draw(record)
+    files = save(name, record, figure, out, formats)
+    provenance = embedded(record, files[-1].read_text(encoding="utf-8"))
+    return Drawn(module.name, tuple(files), _image(files, figure), provenance, record.notes)
+
+
+def _image(files: Sequence[Path], figure: "Figure") -> bytes:
+    """The PNG that was saved; without one, another."""
+    from ssmail.figures import style
+
+    for path in files:
+        if path.suffix == ".png":
+            return path.read_bytes()
+    picture = BytesIO()
+    with style.sheet():
+        figure.savefig(picture, format="png", dpi=SHOWN)
+    return picture.getvalue()
