@@ -25,7 +25,7 @@ demo: $(INSTALLED)  ## train SS-AIL on the Y-Junction (a few minutes) and draw i
 	@echo "Now look at results/figures/fig5_modes.png (trajectories over the lanes) and fig4_stability.png (error over epochs)."
 
 test: $(INSTALLED)  ## the tests, without the slow ones
-	$(BIN)/pytest -m "not slow"
+	$(BIN)/pytest -n 2 -m "not slow"
 
 test-slow: $(INSTALLED)  ## the slow tests (minutes)
 	$(BIN)/pytest -m slow

@@ -53,7 +53,7 @@ def store_claim(add_run: AddRun) -> Callable[[str, Mapping[Any, Sequence[Mapping
         if needed.ablation is None:
             specs = {method: build_spec(method, needed.environment, "smoke") for method in runs}
         else:
-            specs = ablation_specs(needed.ablation, "smoke", values=list(runs))
+            specs = ablation_specs(needed.ablation, "smoke", values=list(runs), environment=needed.environment)
         for group, seeds in runs.items():
             for seed, values in enumerate(seeds):
                 add_run(specs[group], seed, **values)

@@ -136,7 +136,7 @@ def test_rewards_are_kept_within_their_limit() -> None:
     for limit, within in (("1.0", True), ("null", False)):
         made, loop = learner("adversarial.reward_scale=1000", f"adversarial.reward_limit={limit}")
         states, actions = loop.experts.states[:, :-1], loop.experts.actions
-        rewards = made._reward(made.features(states, states[:, 0]), actions)
+        rewards = made.reward(made.features(states, states[:, 0]), actions)
         assert (float(rewards.abs().max().detach()) <= 1) is within
 
 
