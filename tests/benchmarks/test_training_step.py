@@ -3,7 +3,14 @@
 import pytest
 import torch
 
-from benchmarks.training_step import compare_steps, first_results, largest_difference, make_learner, one_step
+from benchmarks.training_step import (
+    check_equal,
+    compare_steps,
+    first_results,
+    largest_difference,
+    make_learner,
+    one_step,
+)
 
 
 @pytest.mark.parametrize("method", ["nri", "dnri"])
@@ -26,4 +33,11 @@ def test_the_table(capsys: pytest.CaptureFixture[str]) -> None:
     compare_steps("dnri", "toy", rounds=1, steps=1)
     printed = capsys.readouterr().out
     assert "dnri, toy, plain" in printed
-    assert "equal to" in printed
+    assert "equal in double precision" in printed
+
+
+def test_forms_that_differ_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even by the last digit, when no digit may differ."""
+    monkeypatch.setattr("benchmarks.training_step.TOLERANCE", 1e-18)
+    with pytest.raises(SystemExit, match="not the same"):
+        check_equal("nri", "toy")
