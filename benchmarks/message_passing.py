@@ -17,7 +17,7 @@ from ssmail.models.decoders import MessageDecoder, make_decoder
 from ssmail.models.edge_perceptron import ScaledEdges
 from ssmail.models.graph_encoder import GraphNoise, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder
-from ssmail.spec import VariationalSpec, used
+from ssmail.spec_sections import VariationalSpec, used
 
 # name: (B, T, N, P), hidden size of encoder and decoder, memory, decoder
 CASES = {

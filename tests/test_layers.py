@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    ("errors", "shaping", "spec", "spec_keys", "strict_yaml", "user_functions"),
+    ("errors", "shaping", "spec", "spec_keys", "spec_sections", "strict_yaml", "user_functions"),
     ("experiments_file",),
     ("experiments",),
     ("data", "envs"),

@@ -8,7 +8,8 @@ import pytest
 from ssmail.errors import InputError
 from ssmail.experiments import ablation, ablation_specs, build_spec
 from ssmail.experiments_file import ENVIRONMENT_VARIABLE
-from ssmail.spec import RunSpec, used
+from ssmail.spec import RunSpec
+from ssmail.spec_sections import used
 from ssmail.user_functions import UserFunction, load, pinned
 
 from .experiments_file import write

@@ -11,7 +11,7 @@ from ssmail_cli.display import write_json
 from ssmail_cli.options import Json
 
 if TYPE_CHECKING:
-    from ssmail.spec import DataSpec
+    from ssmail.spec_sections import DataSpec
 
 IN_FILE = "as in experiments.yaml"
 

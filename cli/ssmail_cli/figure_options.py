@@ -19,6 +19,14 @@ Formats = Annotated[
     list[str] | None,
     typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
 ]
+Stat = Annotated[
+    str | None,
+    typer.Option(
+        "--stat",
+        help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
+        show_default="mean-std",
+    ),
+]
 
 
 def check_formats(formats: Sequence[str]) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail_cli.display import complaint, note
-from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, check_formats, parse_statistic
+from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 
 if TYPE_CHECKING:
@@ -25,14 +25,7 @@ def report(
     ] = None,
     out: OutDir = DEFAULT_OUT,
     formats: Formats = None,
-    stat: Annotated[
-        str | None,
-        typer.Option(
-            "--stat",
-            help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
-            show_default="mean-std",
-        ),
-    ] = None,
+    stat: Stat = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
     """Write the report of the stored runs: verdicts, figures, and the runs behind them. Nothing is trained.

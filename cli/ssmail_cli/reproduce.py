@@ -10,7 +10,7 @@ from ssmail.errors import InputError
 from ssmail.report.wording import duration
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
-from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, check_formats, parse_statistic
+from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
 from ssmail_cli.progress import Sweep, label
 from ssmail_cli.report import draw_or_tell, undrawn, write_report
@@ -60,14 +60,7 @@ def reproduce(
     as_json: Json = False,
     out: OutDir = DEFAULT_OUT,
     formats: Formats = None,
-    stat: Annotated[
-        str | None,
-        typer.Option(
-            "--stat",
-            help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
-            show_default="mean-std",
-        ),
-    ] = None,
+    stat: Stat = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
     """Train what the figures and claims of the paper need, draw the figures, and write the report.

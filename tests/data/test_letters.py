@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from ssmail.data import letters, pen
 from ssmail.experiments import build_spec
-from ssmail.spec import MOST_LETTERS, LettersSpec
+from ssmail.spec_sections import MOST_LETTERS, LettersSpec
 
 
 def params(**changes: object) -> LettersSpec:

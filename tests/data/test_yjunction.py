@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from ssmail.data import yjunction
 from ssmail.errors import InputError
-from ssmail.spec import YJunctionSpec
+from ssmail.spec_sections import YJunctionSpec
 
 
 def params(**changes: object) -> YJunctionSpec:

@@ -6,7 +6,7 @@ import pytest
 from ssmail.data import letters
 from ssmail.data.trajectories import Floats
 from ssmail.evaluation.strokes import polyline_distances, stroke_distances
-from ssmail.spec import LettersSpec
+from ssmail.spec_sections import LettersSpec
 
 BAR = np.stack([np.linspace(0, 1, 101), np.zeros(101)], axis=1)  # a stroke of length 1
 

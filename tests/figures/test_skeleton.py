@@ -17,7 +17,7 @@ from ssmail.data.mocap.dataset import MocapParameters, make_expert_set, make_tra
 from ssmail.errors import InputError
 from ssmail.figures import provenance, skeleton, style
 from ssmail.figures.saving import save_figure
-from ssmail.spec import YJunctionSpec
+from ssmail.spec_sections import YJunctionSpec
 
 JOINTS = ("root", "lfemur", "rfemur", "lowerback", "head")
 PARENTS = (-1, 0, 0, 0, 3)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ssmail.experiments import build_spec
 from ssmail.models.features import Features
-from ssmail.spec import used
+from ssmail.spec_sections import used
 
 
 def whole(*shape: int, seed: int = 0) -> Tensor:

@@ -12,7 +12,7 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.graph_encoder import GraphEncoder, off_diagonal, on_diagonal
 from ssmail.models.message_passing import DENSE_UP_TO, EdgeFunction, SumOverSenders, TypedMessages, sum_over_senders
-from ssmail.spec import ModelSpec
+from ssmail.spec_sections import ModelSpec
 
 SPEC = ModelSpec(
     hidden=8,

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ssmail.models.decoders import make_decoder
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
-from ssmail.spec import VariationalSpec
+from ssmail.spec_sections import VariationalSpec
 
 SPEC = VariationalSpec(
     root_relative=False,

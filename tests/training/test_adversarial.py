@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ssmail.experiments import build_spec
-from ssmail.spec import used
+from ssmail.spec_sections import used
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.loop import TrainingLoop
 

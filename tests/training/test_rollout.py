@@ -11,7 +11,7 @@ from ssmail.envs.integrator import Integrator
 from ssmail.experiments import build_spec
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
-from ssmail.spec import used
+from ssmail.spec_sections import used
 from ssmail.training.rollout import Rollout, rollout
 
 INTEGRATOR = Integrator(Scaling(-20.0, 45.0, -0.7, 1.1))

@@ -24,7 +24,7 @@ from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.data.yjunction import LANES, make_expert_set
 from ssmail.errors import InputError
-from ssmail.spec import LettersSpec, YJunctionSpec
+from ssmail.spec_sections import LettersSpec, YJunctionSpec
 
 Contents = Mapping[str, Any]
 

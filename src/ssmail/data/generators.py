@@ -2,7 +2,7 @@
 
 from ssmail.data import letters, yjunction
 from ssmail.data.trajectories import ExpertSet
-from ssmail.spec import DataSpec
+from ssmail.spec_sections import DataSpec
 
 
 def generate(data: DataSpec) -> ExpertSet:

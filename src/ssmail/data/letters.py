@@ -20,7 +20,7 @@ import numpy as np
 from ssmail import strict_yaml
 from ssmail.data.pen import Timeline, along, approach, arc_lengths, progress
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
-from ssmail.spec import LettersSpec
+from ssmail.spec_sections import LettersSpec
 
 WIDTH, GAP = 0.8, 0.4  # of a letter and between letters
 START = np.array([0.2, -0.55])  # where a pen begins, from the lower left corner of its letter

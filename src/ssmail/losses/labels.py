@@ -16,7 +16,7 @@ from torch import Tensor
 from ssmail.errors import InputError
 from ssmail.experiments import function_folders
 from ssmail.shaping import Knots
-from ssmail.spec import SelfSupervisionSpec
+from ssmail.spec_sections import SelfSupervisionSpec
 from ssmail.user_functions import UserFunction, load, told
 
 LabelFunction = Callable[[Tensor], Tensor]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.message_passing import TypedMessages
-from ssmail.spec import ModelSpec
+from ssmail.spec_sections import ModelSpec
 
 
 class TwinLinear(nn.Module):

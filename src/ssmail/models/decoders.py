@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ssmail.models.edge_layers import RELU, TANH, Activation, EdgeLayers
 from ssmail.models.graph_encoder import off_diagonal
 from ssmail.models.message_passing import PairLayer
-from ssmail.spec import VariationalSpec
+from ssmail.spec_sections import VariationalSpec
 
 
 class PairPerceptron(nn.Module):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ssmail.models.standards import Standards
-from ssmail.spec import ModelSpec, VariationalSpec
+from ssmail.spec_sections import ModelSpec, VariationalSpec
 
 
 @dataclass(frozen=True)

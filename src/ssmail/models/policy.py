@@ -6,7 +6,7 @@ from torch import Tensor, nn
 from ssmail.models.actor import Actor
 from ssmail.models.graph_encoder import GraphEncoder, GraphNoise, Memory, sample_graph
 from ssmail.models.standards import Reach
-from ssmail.spec import ModelSpec
+from ssmail.spec_sections import ModelSpec
 
 
 class GraphPolicy(nn.Module):

@@ -17,7 +17,7 @@ from ssmail.models.edge_layers import CHUNK
 from ssmail.models.edge_memory import both_ways
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron, ScaledEdges, edge_graph
 from ssmail.models.graph_encoder import Memory, remember
-from ssmail.spec import VariationalSpec
+from ssmail.spec_sections import VariationalSpec
 
 
 def edge_type_head(inputs: int, spec: VariationalSpec) -> nn.Sequential:

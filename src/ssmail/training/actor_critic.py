@@ -14,7 +14,7 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import graph_entropy
 from ssmail.models.policy import GraphPolicy
-from ssmail.spec import SacSpec
+from ssmail.spec_sections import SacSpec
 from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
 from ssmail.training.updates import clipped_step

@@ -19,7 +19,7 @@ from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.models.standards import Reach
 from ssmail.rewards import gail_reward, ssail_reward, wail_reward
-from ssmail.spec import Pairing, SelfSupervisionSpec, used
+from ssmail.spec_sections import Pairing, SelfSupervisionSpec, used
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learning import Setting

@@ -8,7 +8,7 @@ from torch import nn
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.models.standards import Reach
-from ssmail.spec import used
+from ssmail.spec_sections import used
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.policy_predictor import PolicyPredictor

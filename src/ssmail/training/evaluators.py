@@ -12,8 +12,9 @@ from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 from ssmail.evaluation.protocol import forecast_metrics, full_metrics, letter_metrics, one_step_mse, quick_metrics
-from ssmail.spec import RunSpec, used
-from ssmail.training.experts import scaled_batch
+from ssmail.spec import RunSpec
+from ssmail.spec_sections import used
+from ssmail.training.experts import as_doubles, scaled_batch
 from ssmail.training.learning import Predictor, Setting
 from ssmail.training.references import ConstantVelocity, CopyLast
 
@@ -75,7 +76,7 @@ class _Evaluator:
 
     def raw_positions(self, states: Tensor) -> Floats:
         """Scaled states (..., 2P) -> raw positions (..., P)."""
-        raw: Floats = self.scaling.unscale_positions(states[..., : states.shape[-1] // 2].double().cpu().numpy())
+        raw: Floats = self.scaling.unscale_positions(as_doubles(states[..., : states.shape[-1] // 2]))
         return raw
 
 
@@ -224,7 +225,9 @@ class LetterEvaluator(_Evaluator):
         return made.reshape(s, *states.shape)
 
     def _measure(self, predicted: Tensor, truth: Tensor) -> dict[str, float]:
-        return letter_metrics(_numpy(predicted), _numpy(truth), self.data.centre_lines, self.begin, self.scaling)
+        return letter_metrics(
+            as_doubles(predicted), as_doubles(truth), self.data.centre_lines, self.begin, self.scaling
+        )
 
 
 class ForecastEvaluator(_Evaluator):
@@ -245,7 +248,7 @@ class ForecastEvaluator(_Evaluator):
         values: dict[str, float] = {}
         for split, truth in {"validation": self.validation_states, "train": trained}.items():
             predicted = predictor.free_run(truth[:, :1], truth.shape[1] - 1, self.generator)
-            measured, _ = forecast_metrics(_numpy(predicted[None, :, 1:]), _numpy(truth[:, 1:]), self.scaling)
+            measured, _ = forecast_metrics(as_doubles(predicted[None, :, 1:]), as_doubles(truth[:, 1:]), self.scaling)
             values |= {f"{split}/{name}": value for name, value in measured.items()}
         return values
 
@@ -305,8 +308,8 @@ class ForecastEvaluator(_Evaluator):
         observed = states[:, :h].repeat(samples, 1, 1, 1)
         noise = self._noise(observed, steps) if noisy else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
-        made = _numpy(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
-        return made, _numpy(states[:, h : h + steps])
+        made = as_doubles(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
+        return made, as_doubles(states[:, h : h + steps])
 
     def _noise(self, observed: Tensor, steps: int) -> Tensor:
         """The noise on every state that is read, the same for all methods and seeds."""
@@ -316,11 +319,6 @@ class ForecastEvaluator(_Evaluator):
         if self.forecast.noise_on == "history":
             noise[:, h:] = 0
         return noise.to(self.device)
-
-
-def _numpy(states: Tensor) -> Floats:
-    array: Floats = states.double().cpu().numpy()
-    return array
 
 
 EVALUATORS: dict[str, Callable[[RunSpec, ExpertSet, Setting], Evaluator]] = {

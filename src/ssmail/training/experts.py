@@ -1,10 +1,11 @@
-"""Expert trajectories as scaled tensors."""
+"""Expert trajectories as scaled tensors, and tensors as arrays again."""
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ssmail.data.scaling import Scaling
-from ssmail.data.trajectories import Trajectories
+from ssmail.data.trajectories import Floats, Trajectories
 from ssmail.training.replay import Batch
 
 
@@ -18,3 +19,9 @@ def scaled_batch(trajectories: Trajectories, scaling: Scaling, device: torch.dev
         torch.as_tensor(velocities[:, 1:], dtype=torch.float32, device=device),
         source,
     )
+
+
+def as_doubles(tensor: Tensor) -> Floats:
+    """Its values in double precision, in the CPU's memory."""
+    array: Floats = tensor.double().cpu().numpy()
+    return array

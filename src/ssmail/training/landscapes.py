@@ -15,6 +15,7 @@ from ssmail.evaluation.landscape import Plane, closeness, mean_cosine, nearest_p
 from ssmail.losses.self_supervision import mix, nearest
 from ssmail.models.features import Features
 from ssmail.spec import RunSpec
+from ssmail.training.experts import as_doubles
 from ssmail.training.learning import Learner, Predictor, Setting
 
 REFERENCES = 2  # training trajectories whose states stand in for what a point of the plane leaves open
@@ -98,11 +99,11 @@ class Landscapes:
         all_steps = Moments.of(learner.features, states, experts.actions[chosen])
         self.references = Moments(*(part[:, steps].flatten(0, 1) for part in vars(all_steps).values()))  # (K)
         self.agents = states.shape[2]
-        everywhere = _numpy(experts.states[..., :2])  # (B, T + 1, N, 2)
+        everywhere = as_doubles(experts.states[..., :2])  # (B, T + 1, N, 2)
         self.plane = Plane.around(everywhere)
         points, tracks = self.plane.points, [everywhere[:, :, n].reshape(-1, 2) for n in range(self.agents)]
         self.ways = np.stack([nearest_points(points, track) - points for track in tracks])
-        places = [_numpy(self.references.states[:, n, :2]) for n in range(self.agents)]
+        places = [as_doubles(self.references.states[:, n, :2]) for n in range(self.agents)]
         self.weights = torch.as_tensor(np.stack([closeness(points, place) for place in places]))
 
     @classmethod
@@ -168,16 +169,16 @@ class Landscapes:
         actions = mix(taken.repeat(count, 1, 1, 1), experts.actions.repeat(count, 1, 1, 1), each)
         at = Moments.of(self.learner.features, states, actions)
         found = [position_gradient(self.learner, at, agent)[1] for agent in range(self.agents)]
-        gradient = _numpy(torch.stack(found, dim=2)).reshape(count, rollouts, -1, self.agents, 2)
-        here = _numpy(states[:, :-1, :, :2]).reshape(gradient.shape)
-        ways = _numpy(experts.states[:, :-1, :, :2]) - here
+        gradient = as_doubles(torch.stack(found, dim=2)).reshape(count, rollouts, -1, self.agents, 2)
+        here = as_doubles(states[:, :-1, :, :2]).reshape(gradient.shape)
+        ways = as_doubles(experts.states[:, :-1, :, :2]) - here
         behind = slice(len(BEHIND))
         values = {
             "landscape/behind_cosine": mean_cosine(gradient[behind], ways[behind], self.plane.spacing),
             "landscape/ahead_cosine": mean_cosine(gradient[len(BEHIND) :], ways[len(BEHIND) :], self.plane.spacing),
         }
         arrays = {
-            "vector_field/alpha": _numpy(alphas),
+            "vector_field/alpha": as_doubles(alphas),
             "vector_field/gradient": _half(gradient),
             "vector_field/current": self._raw(made[:, :-1]),
             "vector_field/expert": self._raw(experts.states[:, :-1]),
@@ -194,7 +195,9 @@ class Landscapes:
 
     def _raw(self, states: Tensor) -> np.ndarray:
         """Raw positions (..., 2) of scaled states."""
-        raw: np.ndarray = self.setting.integrator.scaling.unscale_positions(_numpy(states[..., :2])).astype(np.float32)
+        raw: np.ndarray = self.setting.integrator.scaling.unscale_positions(as_doubles(states[..., :2])).astype(
+            np.float32
+        )
         return raw
 
 
@@ -205,11 +208,6 @@ def _spread(length: int, count: int) -> np.ndarray:
 
 def _double(tensor: Tensor) -> Tensor:
     return tensor.double().cpu()
-
-
-def _numpy(tensor: Tensor) -> np.ndarray:
-    array: np.ndarray = tensor.double().cpu().numpy()
-    return array
 
 
 def _half(values: np.ndarray) -> np.ndarray:

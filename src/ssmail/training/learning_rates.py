@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import torch
 
-from ssmail.spec import TrainingSpec
+from ssmail.spec_sections import TrainingSpec
 
 
 class DecayingRates:

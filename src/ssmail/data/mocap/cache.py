@@ -15,7 +15,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from ssmail.errors import InputError, SsmailError
-from ssmail.spec import Frozen
+from ssmail.spec_sections import Frozen
 
 RECORD = "downloads.json"
 

@@ -26,7 +26,7 @@ from ssmail.data.mocap.source import Source, find_subject, open_source, shown
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError
-from ssmail.spec import Frozen
+from ssmail.spec_sections import Frozen
 
 SPLITS = ("train", "validation", "test")
 MOST_TRIALS = 1000
