@@ -127,3 +127,12 @@ def test_an_empty_store_has_a_report(store: Store) -> None:
 def test_a_folder_that_cannot_be_written(written: Written) -> None:
     with pytest.raises(InputError, match="/proc/none cannot be written"):
         write(written.report, Path("/proc/none"))
+
+
+def test_the_database_is_named_from_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store.open(tmp_path / "results" / "ssmail.db")
+    monkeypatch.chdir(tmp_path)
+    assert gather(store, [], [], COMMAND).database == "results/ssmail.db"
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert gather(store, [], [], COMMAND).database == str(tmp_path / "results" / "ssmail.db")

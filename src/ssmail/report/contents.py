@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 from ssmail.evaluation.claims.verdicts import Part, Sample, Verdict
@@ -85,7 +86,7 @@ def gather(
         key=lambda run: (run.environment, run.method, run.spec_hash, run.seed, run.started),
     )
     return Report(
-        database=store.where,
+        database=_nearby(store.where),
         command=command,
         written=datetime.now(UTC),
         judgements=tuple(judgements),
@@ -94,6 +95,12 @@ def gather(
         differs=spec_differences(runs),
         unfinished=tuple(unfinished),
     )
+
+
+def _nearby(where: str) -> str:
+    """The path from the working folder, if it lies in it; a report is read on other machines, too."""
+    path = Path(where)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else where
 
 
 def samples_of(found: Judgement) -> list[tuple[Part, Sample]]:

@@ -1,0 +1,83 @@
+"""results/reference: the figures, verdicts and tables that we show come from the database that we show."""
+
+import io
+import re
+import shutil
+import sqlite3
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from ssmail.evidence import judge
+from ssmail.figures import FIGURES
+from ssmail.figures.saving import csv_text
+from ssmail.store import Store
+
+ROOT = Path(__file__).parents[2]
+REFERENCE = ROOT / "results" / "reference"
+NAMES = tuple(f"fig{number}" for number in range(1, 10))
+LARGEST = 15_000_000  # bytes
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of the database, so that no test writes beside the committed one."""
+    return Path(shutil.copy(REFERENCE / "reference.db", tmp_path_factory.mktemp("reference")))
+
+
+@pytest.fixture(scope="module")
+def store(copy: Path) -> Store:
+    return Store.open(str(copy))
+
+
+def redrawn(store: Store, name: str) -> pd.DataFrame:
+    """What the figure shows of the store, as it would be read from its CSV."""
+    return pd.read_csv(io.StringIO(csv_text(FIGURES[name].collect(store).table())))
+
+
+def committed(name: str) -> pd.DataFrame:
+    return pd.read_csv(REFERENCE / "figures" / f"{FIGURES[name].stem}.csv")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_figure_shows_what_its_csv_says(store: Store, name: str) -> None:
+    assert (REFERENCE / "figures" / f"{FIGURES[name].stem}.png").is_file()
+    # another machine may add up in another order
+    pd.testing.assert_frame_equal(redrawn(store, name), committed(name), rtol=1e-6, atol=1e-12)
+
+
+def test_another_value_shows_in_the_figure(copy: Path, tmp_path: Path) -> None:
+    """The control: one value of a run that figure 4 shows, a thousandth larger."""
+    shown = committed("fig4")
+    other = Path(shutil.copy(copy, tmp_path))
+    database = sqlite3.connect(other)
+    with database:
+        changed = database.execute(
+            "UPDATE metric SET value = value * 1.001 WHERE run_id = ? AND name = 'train/mode_mse' AND step = 3",
+            (shown["run_id"].dropna().iloc[0],),
+        )
+    database.close()
+    assert changed.rowcount == 1
+    now = redrawn(Store.open(str(other)), "fig4")
+    with pytest.raises(AssertionError):
+        pd.testing.assert_frame_equal(now, shown, rtol=1e-6, atol=1e-12)
+
+
+def test_five_seeds_of_each_spec_and_every_run_has_ended(store: Store) -> None:
+    seeds: dict[str, set[int]] = {}
+    for run in store.runs():
+        assert run.state in ("finished", "diverged")
+        assert run.profile == "quick"
+        seeds.setdefault(run.spec_hash, set()).add(run.seed)
+    assert set(map(frozenset, seeds.values())) == {frozenset(range(5))}
+
+
+def test_the_database_is_small(copy: Path) -> None:
+    assert copy.stat().st_size < LARGEST
+
+
+@pytest.mark.parametrize("page", [REFERENCE / "report.md", ROOT / "README.md"])
+def test_the_verdicts_that_are_shown_are_those_of_the_database(store: Store, page: Path) -> None:
+    shown = dict(re.findall(r"^\| (C[1-8]) [^|]*\|[^|]*\| \*\*(\w+)\*\* \|", page.read_text("utf-8"), re.MULTILINE))
+    assert shown == {found.claim.name: str(found.verdict) for found in judge(store)}
