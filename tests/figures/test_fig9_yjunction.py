@@ -56,8 +56,16 @@ def test_the_newest_run_with_the_expert_set_is_the_source(store: Store, add_run:
     without = add_run(2, state=RunState.DIVERGED)
     assert fig9_yjunction.collect(store).provenance.run_ids == (second,)
     assert fig9_yjunction.collect(store, [first, without]).provenance.run_ids == (first,)
+
+
+def test_a_run_without_the_expert_set_stands_for_one_on_the_same_data(store: Store, add_run: Any) -> None:
+    """As in a compact database, which holds the set once."""
+    holds = add_run(0)
+    add_run(1, dataset_hash="e" * 64)
+    same, other = (add_run(2 + n, state=RunState.DIVERGED, dataset_hash=data * 64) for n, data in enumerate("df"))
+    assert fig9_yjunction.collect(store, [same]).provenance.run_ids == (holds,)
     with pytest.raises(InputError, match=r"^none of the given runs holds the expert set of yjunction; "):
-        fig9_yjunction.collect(store, [without])
+        fig9_yjunction.collect(store, [other])
 
 
 def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) -> None:

@@ -56,7 +56,8 @@ class YJunctionRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> YJunctionRecord:
-    """The environment as the newest run that holds it stored it; among the given ids, if there are any.
+    """The environment as the newest run that holds it stored it; among the given ids, if there are any, else among the
+    runs on the same data (a compact database holds the expert set once).
 
     Raises NoRuns when no run of the environment holds its expert set, InputError for an unfit id.
     """
@@ -79,9 +80,11 @@ def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tup
     needed = figure_requirements(NAME)
     environment = needed.environment
     stored = store.runs(ids=ids) if ids else store.runs(environment=environment, profile=profile)
-    fitting = [
-        run for run in stored if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))
-    ]
+    fitting = _holding(store, stored, environment)
+    if not fitting and ids:
+        data = {run.dataset_hash for run in stored if run.environment == environment and run.dataset_hash}
+        others = [run for run in store.runs(environment=environment) if run.dataset_hash in data]
+        fitting = _holding(store, others, environment)
     if fitting:
         return fitting[-1], (f"the environment is that of run {fitting[-1].name}.",)
     remedy = f"run {command(needed.methods[0], environment, profile)}"
@@ -89,6 +92,11 @@ def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tup
         raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
     found = "no finished run" if stored else "no run"
     raise NoRuns(f"{NAME} has nothing to draw: {store.where} holds {found} on {environment}; {remedy}.")
+
+
+def _holding(store: Store, runs: Sequence[RunRow], environment: str) -> list[RunRow]:
+    """Those of the runs that hold the environment's expert set."""
+    return [run for run in runs if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))]
 
 
 def _strays(trajectories: Floats, line: Floats) -> float:

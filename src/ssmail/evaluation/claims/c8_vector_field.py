@@ -20,7 +20,7 @@ TOWARDS = 0.5  # cosine: within 60 degrees
 
 COSINE = (
     "landscape/behind_cosine: mean cosine between D's slope and the direction to the expert at negative alpha, "
-    "early in training"
+    "after half of the epochs"
 )
 
 
