@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssmail.spec_keys import leaves
-from ssmail.store.database import Store
 from ssmail.store.queries import RunRow
+from ssmail.store.run_store import Store
 from ssmail.store.schema import RunState
 
 
