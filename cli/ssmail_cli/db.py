@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError
+from ssmail.report.wording import counted
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, write_json
 
@@ -79,7 +80,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
         write_json([asdict(problem) for problem in problems], None)
     for problem in problems if not as_json else ():
         print(f"{problem.check}: {problem.problem}; {problem.remedy}")
-    note(f"{db}: {_count(len(problems), 'problem')}" if problems else f"{db}: no problem found")
+    note(f"{db}: {counted(len(problems), 'problem')}" if problems else f"{db}: no problem found")
     if problems:
         raise typer.Exit(PROBLEMS)
 
@@ -124,7 +125,7 @@ def merge(
         print(_difference(difference))
     print(f"merged {done.other} into {done.target}: {_fates(done)}")
     if done.without_checkpoints:
-        note(f"{_count(len(done.without_checkpoints), 'run')} came without all checkpoints: {other} lacks them")
+        note(f"{counted(len(done.without_checkpoints), 'run')} came without all checkpoints: {other} lacks them")
 
 
 @app.command()
@@ -177,11 +178,11 @@ def _summary(found: "DatabaseInformation") -> str:
     revision = found.revision or "none"
     if found.revision != found.newest_revision:
         revision += f" ({found.newest_revision} is the newest; `ssmail db upgrade`)"
-    runs = _count(sum(count.runs for count in found.runs), "run")
+    runs = counted(sum(count.runs for count in found.runs), "run")
     return (
         f"{found.path}: schema {revision}, {_size(found.size_bytes)} ({_size(found.free_bytes)} of it free), {runs}\n"
-        f"{_count(found.metrics, 'value')} of metrics; {_count(found.arrays, 'array')}, {_size(found.array_bytes)} "
-        f"({100 * found.array_share:.0f} % of the size); {_count(found.artifacts, 'checkpoint file')}"
+        f"{counted(found.metrics, 'value')} of metrics; {counted(found.arrays, 'array')}, {_size(found.array_bytes)} "
+        f"({100 * found.array_share:.0f} % of the size); {counted(found.artifacts, 'checkpoint file')}"
     )
 
 
@@ -197,7 +198,7 @@ def _fates(done: "Merge") -> str:
         Fate.BUSY: "left out: being computed",
         Fate.DIFFERENT: "left out: different from the run that is there",
     }
-    counts = [f"{_count(done.count(fate), 'run')} {text}" for fate, text in words.items() if done.count(fate)]
+    counts = [f"{counted(done.count(fate), 'run')} {text}" for fate, text in words.items() if done.count(fate)]
     return ", ".join(counts) or "no runs in it"
 
 
@@ -220,19 +221,15 @@ def _merge_json(done: "Merge") -> dict[str, Any]:
 
 def _tell(done: "Compact", needed: "Needs", others: int) -> None:
     """The file on stdout, what is not in it on stderr."""
-    print(f"wrote {done.path}, {_size(done.size_bytes)}: {_count(done.runs, 'run')}")
+    print(f"wrote {done.path}, {_size(done.size_bytes)}: {counted(done.runs, 'run')}")
     note(
-        f"left out: {_count(others, 'other run')}; {_count(done.left_out_artifacts, 'checkpoint file')}; "
-        f"{_count(done.left_out_metrics, 'value')} of metrics (kept: every last one, and the curves of "
-        f"{', '.join(sorted(needed.wanted.curves))}); {_count(done.left_out_arrays, 'array')} (kept: {done.arrays}, of "
-        f"{done.thinned} of them the part that is drawn)"
+        f"left out: {counted(others, 'other run')}; {counted(done.left_out_artifacts, 'checkpoint file')}; "
+        f"{counted(done.left_out_metrics, 'value')} of metrics (kept: every last one, and the curves of "
+        f"{', '.join(sorted(needed.wanted.curves))}); {counted(done.left_out_arrays, 'array')} (kept: {done.arrays}, "
+        f"of {done.thinned} of them the part that is drawn)"
     )
     for figure, reason in needed.undrawable.items():
         note(f"{figure} cannot be drawn from it ({reason.removesuffix('.')})")
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _size(size: int) -> str:

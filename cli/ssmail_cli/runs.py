@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError
+from ssmail.report.wording import counted
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
 from ssmail_cli.results import rows_with_metrics, run_row, shown_on
@@ -146,7 +147,7 @@ def export(
         write_json([{**run_row(run), "spec": run.spec, "metrics": _metrics(store, run)} for run in runs], out)
     else:
         write_csv(_export_rows(store, runs), EXPORT_COLUMNS, out)
-    note(f"exported {len(runs)} run{'' if len(runs) == 1 else 's'}{f' to {out}' if out else ''}")
+    note(f"exported {counted(len(runs), 'run')}{f' to {out}' if out else ''}")
 
 
 @app.command()
