@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.edge_layers import between_different
 from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
@@ -64,9 +65,7 @@ def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[T
 def off_diagonal(pairs: Tensor) -> Tensor:
     """(B, T, N, N, H) -> (B, T, N * (N - 1), H): the edges between different agents, row by row."""
     b, t, n, _, h = pairs.shape
-    return (
-        pairs.reshape(b, t, n * n, h)[:, :, 1:].view(b, t, n - 1, n + 1, h)[:, :, :, :n].reshape(b, t, n * (n - 1), h)
-    )
+    return between_different(pairs.flatten(0, 1)).reshape(b, t, n * (n - 1), h)
 
 
 def on_diagonal(edges: Tensor, agents: int) -> Tensor:
