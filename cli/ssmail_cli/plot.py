@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail.errors import InputError
-from ssmail_cli.display import complaint, note
+from ssmail_cli.display import note
+from ssmail_cli.drawing import INCOMPLETE, draw_all
 from ssmail_cli.figure_options import ALL, DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 from ssmail_cli.results import SHOWN, shown_on
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 SKELETON = "skeleton"
 OF_A_RUN = ("landscape", "film")
-INCOMPLETE = 3
 DEFAULT_GROUPS = "method"
 DEFAULT_METRICS = "; ".join(f"{shown.curve} of {name}" for name, shown in SHOWN.items())
 DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
@@ -153,22 +153,11 @@ def _draw_all(
     formats: Sequence[str] | None,
 ) -> None:
     """The paper's figures, each if it can be drawn; raises Exit(INCOMPLETE) when one cannot."""
-    from ssmail.figures import FIGURES
-
     if list(figures) != [ALL]:
         raise InputError(f"{ALL} is every figure of the paper already; give it alone.")
     if ids:
         raise InputError(f"{ALL} draws the runs of each figure; leave --runs out.")
-    complete = True
-    for name, module in {module.name: module for module in FIGURES.values()}.items():
-        try:
-            record = module.collect(store, profile=profile, statistic=statistic)
-            _save(name, module.stem, record, module.draw(record), out, formats)
-        except Exception as error:  # the other figures are to be drawn whatever is wrong with this one
-            reason = complaint(error).removeprefix(f"{name} has nothing to draw: ")
-            note(f"{name} is not drawn: {reason}")
-            complete = False
-    if not complete:
+    if any(drawn.lacks for drawn in draw_all(store, out, formats or ["png"], profile, statistic)):
         raise typer.Exit(INCOMPLETE)
 
 

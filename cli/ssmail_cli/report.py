@@ -6,16 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail_cli.display import complaint, note
+from ssmail_cli.drawing import INCOMPLETE, draw_all
 from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 
 if TYPE_CHECKING:
-    from ssmail.evaluation.statistics import Statistic
     from ssmail.report.drawing import Drawn
     from ssmail.store import Store
-
-INCOMPLETE = 3
 
 
 def report(
@@ -33,50 +30,14 @@ def report(
     Draws every figure whose runs are stored into --out, and beside that folder writes report.md and report.html, one
     page without any other file. Prints the paths. Exit code 3: a figure could not be drawn; the report says why.
     """
-    from ssmail.figures import FIGURES
-
     check_formats(formats or [])
     statistic = parse_statistic(stat, [ALL])
     store = open_store(db)
-    figures = [
-        draw_or_tell(name, store, None, out, formats or ["png"], profile, statistic)
-        for name in dict.fromkeys(module.name for module in FIGURES.values())
-    ]
+    figures = draw_all(store, out, formats or ["png"], profile, statistic)
     command = f"ssmail report --db {db}" + (f" --profile {profile}" if profile else "")
     write_report(store, figures, out, command, profile)
     if any(drawn.lacks for drawn in figures):
         raise typer.Exit(INCOMPLETE)
-
-
-def draw_or_tell(
-    name: str,
-    store: "Store",
-    runs: Sequence[str] | None,
-    out: Path,
-    formats: Sequence[str],
-    profile: str | None,
-    statistic: "Statistic | None",
-) -> "Drawn":
-    """The figure, with its notes on stderr and its paths on stdout; or, with a line on stderr, why it is not drawn."""
-    from ssmail.report.drawing import draw
-
-    try:
-        drawn = draw(name, store, runs, out, formats, profile=profile, statistic=statistic)
-    except Exception as error:  # the other figures are to be drawn whatever is wrong with this one
-        return undrawn(name, complaint(error).removeprefix(f"{name} has nothing to draw: "))
-    for remark in drawn.notes:
-        note(f"{name}: {remark}")
-    for path in drawn.files:
-        typer.echo(path)
-    return drawn
-
-
-def undrawn(name: str, reason: str) -> "Drawn":
-    """A figure that is not drawn, which is told on stderr."""
-    from ssmail.report.drawing import Drawn
-
-    note(f"{name} is not drawn: {reason}")
-    return Drawn(name, lacks=reason)
 
 
 def write_report(

@@ -10,10 +10,11 @@ from ssmail.errors import InputError
 from ssmail.report.wording import duration
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
+from ssmail_cli.drawing import draw_or_tell, undrawn
 from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
 from ssmail_cli.progress import Sweep, label
-from ssmail_cli.report import draw_or_tell, undrawn, write_report
+from ssmail_cli.report import write_report
 from ssmail_cli.reproduction_data import DataFiles, look_for_data, make_data, settled_runs, tell
 from ssmail_cli.sweep import SOME_RUNS_FAILED, Rows, compute, finish, is_interrupted, plan, result_rows
 from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device

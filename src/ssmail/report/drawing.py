@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,11 +20,11 @@ SHOWN = 250  # dots per inch of a picture that is in the report alone
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure: its `files` (the CSV last), `image` (a PNG), `provenance` and `notes`, or why it `lacks` all this."""
+    """A figure: its `files` (the CSV last), `provenance` and `notes`, or why it `lacks` all this."""
 
     name: str
     files: tuple[Path, ...] = ()
-    image: bytes = b""
+    figure: "Figure | None" = None
     provenance: Provenance | None = None
     notes: tuple[str, ...] = ()
     lacks: str = ""
@@ -37,6 +38,20 @@ class Drawn:
     def summary(self) -> str:
         """What it shows, in a line."""
         return FIGURES[self.name].summary
+
+    @cached_property
+    def image(self) -> bytes:
+        """The PNG that was saved; without one, another; nothing of a figure that is not drawn."""
+        from ssmail.figures import style
+
+        for path in self.files:
+            if path.suffix == ".png":
+                return path.read_bytes()
+        picture = BytesIO()
+        if self.figure is not None:
+            with style.sheet():
+                self.figure.savefig(picture, format="png", dpi=SHOWN)
+        return picture.getvalue()
 
 
 def draw(
@@ -60,17 +75,4 @@ def draw(
     figure = module.draw(record)
     files = save(name, record, figure, out, formats)
     provenance = embedded(record, files[-1].read_text(encoding="utf-8"))
-    return Drawn(module.name, tuple(files), _image(files, figure), provenance, record.notes)
-
-
-def _image(files: Sequence[Path], figure: "Figure") -> bytes:
-    """The PNG that was saved; without one, another."""
-    from ssmail.figures import style
-
-    for path in files:
-        if path.suffix == ".png":
-            return path.read_bytes()
-    picture = BytesIO()
-    with style.sheet():
-        figure.savefig(picture, format="png", dpi=SHOWN)
-    return picture.getvalue()
+    return Drawn(module.name, tuple(files), figure, provenance, record.notes)
