@@ -11,13 +11,13 @@ import torch
 from edge_gather import GatherDynamicEncoder, GatherEmbedding, GatherMessageDecoder, GatherRecurrentDecoder
 from torch import nn
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import VariationalSpec, used
 from ssmail.losses.likelihood import variational_loss
 from ssmail.models.decoders import MessageDecoder, make_decoder
 from ssmail.models.edge_perceptron import ScaledEdges
 from ssmail.models.graph_encoder import GraphNoise, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder
-from ssmail.spec_sections import VariationalSpec, used
 
 # name: (B, T, N, P), hidden size of encoder and decoder, memory, decoder
 CASES = {

@@ -14,7 +14,7 @@ import torch
 from message_passing import compare
 from training_step import report
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.store import Store
 from ssmail.training.loop import TrainingLoop
 

@@ -27,10 +27,10 @@ try:  # as a script, and from the tests
 except ModuleNotFoundError:
     from benchmarks.edge_gather import make_plain
 
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
-from ssmail.experiments import build_spec
-from ssmail.spec import RunSpec
 from ssmail.training.learning import Setting
 from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import function_folders
-from ssmail.experiments_file import ENVIRONMENT_VARIABLE
+from ssmail.config.experiments import function_folders
+from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
+from ssmail.config.user_functions import UserFunction, pinned
 from ssmail.store import Store
-from ssmail.user_functions import UserFunction, pinned
 from ssmail_cli.main import run
 
 from .experiments_file import write

@@ -8,18 +8,15 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    ("errors", "shaping", "spec", "spec_keys", "spec_sections", "strict_yaml", "user_functions"),
-    ("experiments_file",),
-    ("experiments",),
-    ("data", "envs"),
-    ("models",),
-    ("losses", "rewards"),
-    ("training", "evaluation"),
+    ("errors",),
+    ("config",),
+    ("data", "envs", "models"),
+    ("losses", "evaluation"),
+    ("training",),
     ("store",),
     ("execution",),
-    ("figures",),
-    ("evidence",),
-    ("report",),
+    ("plots",),
+    ("paper",),
     ("ssmail_cli",),
 )
 FLOOR = {room: height for height, rooms in enumerate(FLOORS) for room in rooms}

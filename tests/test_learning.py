@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.training.loop import TrainingLoop
 
 VALIDATION_SEED = 110  # not one of the reported seeds, nor one that a setting was chosen with

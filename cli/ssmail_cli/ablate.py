@@ -48,8 +48,8 @@ def ablate(
     A run for each value and seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops. Each
     ablation is an entry of experiments.yaml; `ssmail ablate-beta` is the same as `ssmail ablate beta`.
     """
+    from ssmail.config.experiments import ablation, ablation_specs, as_written
     from ssmail.execution.local import Cell
-    from ssmail.experiments import ablation, ablation_specs, as_written
 
     chosen_seeds = parse_seeds(seeds)
     column = _column(ablation(name, environment).key)
@@ -89,7 +89,7 @@ def parse_values(text: str) -> list[Any]:
     """
     import yaml
 
-    from ssmail import strict_yaml
+    from ssmail.config import strict_yaml
 
     try:
         values = strict_yaml.parse(f"[{text}\n]")  # the line ends a comment, which would hide the bracket
@@ -111,9 +111,9 @@ def _column(key: str) -> str:
 
 def _point_to_figures(name: str, environment: str | None, db: str) -> None:
     """A line for each figure that draws the ablation, on that environment."""
-    from ssmail.experiments import ablation, figure_requirements
-    from ssmail.experiments_file import load_experiments
-    from ssmail.figures import FIGURES
+    from ssmail.config.experiments import ablation, figure_requirements
+    from ssmail.config.experiments_file import load_experiments
+    from ssmail.paper.results import FIGURES
 
     trained = ablation(name, environment).environment
     database = "" if db == DEFAULT_DATABASE else f" --db {db}"

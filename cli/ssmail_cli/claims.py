@@ -12,8 +12,8 @@ from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_json
 
 if TYPE_CHECKING:
-    from ssmail.evaluation.claims.verdicts import Part, Sample
-    from ssmail.evidence import Judgement
+    from ssmail.paper.claims import Part, Sample
+    from ssmail.paper.judgement import Judgement
 
 SUMMARY = {
     "claim": "claim",
@@ -54,7 +54,7 @@ def claims(
     Each part of a claim has a statistic and an exact test, defined beforehand (docs/claims.md), at 0.05; Holm's
     correction for all eight claims stands beside it. Every seed counts. CSV has a row for each part, JSON everything.
     """
-    from ssmail.evidence import judge
+    from ssmail.paper.judgement import judge
 
     store = options.open_store(db)
     wanted = [name.strip() for name in only.split(",")] if only is not None else None

@@ -11,7 +11,7 @@ from ssmail_cli.display import write_json
 from ssmail_cli.options import Json
 
 if TYPE_CHECKING:
-    from ssmail.spec_sections import DataSpec
+    from ssmail.config.sections import DataSpec
 
 IN_FILE = "as in experiments.yaml"
 
@@ -98,8 +98,8 @@ def generate_letters(
 
 def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
     """The data section of experiments.yaml with the options that were given. Raises InputError for a bad one."""
-    from ssmail.experiments import build_spec
-    from ssmail.spec import METHODS
+    from ssmail.config.experiments import build_spec
+    from ssmail.config.spec import METHODS
 
     overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
     return build_spec(METHODS[0], environment, "quick", overrides, source="the options").data

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError
-from ssmail.report.wording import counted
+from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, write_json
 
 if TYPE_CHECKING:
-    from ssmail.figures.needs import Needs
-    from ssmail.store.compact import Compact
-    from ssmail.store.information import DatabaseInformation
-    from ssmail.store.merging import Merge
-    from ssmail.store.run_contents import Difference
+    from ssmail.paper.needs import Needs
+    from ssmail.store.maintenance.compact import Compact
+    from ssmail.store.maintenance.information import DatabaseInformation
+    from ssmail.store.maintenance.merge import Merge
+    from ssmail.store.maintenance.run_contents import Difference
 
 app = typer.Typer(help="Inspect, check, back up, merge and export an SQLite database.", rich_markup_mode=None)
 
@@ -32,7 +32,7 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
     The file, the revision of its schema, its size, how much of it the arrays are, and the runs by environment, method,
     profile and state. It is not upgraded.
     """
-    from ssmail.store.information import inform
+    from ssmail.store.maintenance.information import inform
 
     found = inform(db)
     kind = chosen_format(as_json, None)
@@ -54,7 +54,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     A backup of the old state is written beside the file first. Any command that opens an older database upgrades it,
     without a backup.
     """
-    from ssmail.store.backup import upgrade as upgrade_database
+    from ssmail.store.maintenance.backup import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
@@ -73,7 +73,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
     Prints one line for each, with its remedy, and changes nothing. Exit code 0: none, 1: some. It reads the whole file
     and all checkpoints, and may be used while runs are being computed.
     """
-    from ssmail.store.checks import check as check_database
+    from ssmail.store.maintenance.checks import check as check_database
 
     problems = check_database(db)
     if as_json:
@@ -95,7 +95,7 @@ def backup(
 
     Safe while runs are being computed. Checkpoints are files of their own and are not copied.
     """
-    from ssmail.store.backup import back_up
+    from ssmail.store.maintenance.backup import back_up
 
     size = back_up(db, file)
     if as_json:
@@ -115,7 +115,7 @@ def merge(
     With their checkpoints, and all of them or none. Of two runs of one spec, seed and data the one that got further is
     kept; of two that ended, the first, and if they differ that is reported. Runs that are being computed are left out.
     """
-    from ssmail.store.merging import merge as merge_databases
+    from ssmail.store.maintenance.merge import merge as merge_databases
 
     done = merge_databases(db, other)
     if as_json:
@@ -148,11 +148,11 @@ def export(
     """
     from functools import partial
 
-    from ssmail.evidence import judge
-    from ssmail.figures.needs import needs
+    from ssmail.paper.judgement import judge
+    from ssmail.paper.needs import needs
     from ssmail.store import Store
-    from ssmail.store.compact import export_compact, settled_cells
-    from ssmail.store.sqlite_file import existing, require_current
+    from ssmail.store.maintenance.compact import export_compact, settled_cells
+    from ssmail.store.maintenance.sqlite_file import existing, require_current
 
     if not compact:
         raise InputError(
@@ -188,7 +188,7 @@ def _summary(found: "DatabaseInformation") -> str:
 
 def _fates(done: "Merge") -> str:
     """ "3 runs added, 2 already there"; every fate that some run had."""
-    from ssmail.store.merging import Fate
+    from ssmail.store.maintenance.merge import Fate
 
     words = {
         Fate.ADDED: "added",

@@ -10,7 +10,7 @@ from ssmail_cli.display import complaint, note
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.report.drawing import Drawn
+    from ssmail.paper.report.drawing import Drawn
     from ssmail.store import Store
 
 INCOMPLETE = 3
@@ -20,7 +20,7 @@ def draw_all(
     store: "Store", out: Path, formats: Sequence[str], profile: str | None, statistic: "Statistic | None"
 ) -> "list[Drawn]":
     """Every figure, of the runs that it chooses by itself."""
-    from ssmail.figures import FIGURES
+    from ssmail.paper.results import FIGURES
 
     names = dict.fromkeys(module.name for module in FIGURES.values())
     return [draw_or_tell(name, store, None, out, formats, profile, statistic) for name in names]
@@ -36,7 +36,7 @@ def draw_or_tell(
     statistic: "Statistic | None",
 ) -> "Drawn":
     """The figure, with its notes on stderr and its paths on stdout; or, with a line on stderr, why it is not drawn."""
-    from ssmail.report.drawing import draw
+    from ssmail.paper.report.drawing import draw
 
     try:
         drawn = draw(name, store, runs, out, formats, profile=profile, statistic=statistic)
@@ -51,7 +51,7 @@ def draw_or_tell(
 
 def undrawn(name: str, reason: str) -> "Drawn":
     """A figure that is not drawn, which is told on stderr."""
-    from ssmail.report.drawing import Drawn
+    from ssmail.paper.report.drawing import Drawn
 
     note(f"{name} is not drawn: {reason}")
     return Drawn(name, lacks=reason)

@@ -10,7 +10,7 @@ from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, short, write_json
 
 if TYPE_CHECKING:
-    from ssmail.figures.explanation import Agreement, Explanation
+    from ssmail.paper.explanation import Agreement, Explanation
 
 DISAGREES = 1
 COLUMNS = {
@@ -40,8 +40,8 @@ def explain(
     whether the database still agrees: the same runs, and the same values when the figure is collected from them again.
     Exit code 0: it agrees, or cannot be asked; 1: it does not.
     """
-    from ssmail.figures.explanation import compare
-    from ssmail.figures.explanation import explain as explain_figure
+    from ssmail.paper.explanation import compare
+    from ssmail.paper.explanation import explain as explain_figure
 
     found = explain_figure(file)
     agreement = None if options.is_missing(db) else compare(found, options.open_store(db))

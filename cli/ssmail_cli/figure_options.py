@@ -31,8 +31,8 @@ Stat = Annotated[
 
 def check_formats(formats: Sequence[str]) -> None:
     """Raise InputError for a format that figures are not written in."""
-    from ssmail.figures.provenance import FORMATS
-    from ssmail.spec_keys import unknown_name
+    from ssmail.config.keys import unknown_name
+    from ssmail.plots.provenance import FORMATS
 
     for form in formats:
         if form not in FORMATS:
@@ -41,9 +41,9 @@ def check_formats(formats: Sequence[str]) -> None:
 
 def parse_statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
     """The statistic of that name. Raises InputError for an unknown one, and when none of the figures shows any."""
+    from ssmail.config.keys import unknown_name
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.figures import FIGURES
-    from ssmail.spec_keys import unknown_name
+    from ssmail.paper.results import FIGURES
 
     if stat is None:
         return None

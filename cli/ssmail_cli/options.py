@@ -69,8 +69,8 @@ def select_runs(
     figure: str | None,
 ) -> "list[RunRow]":
     """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
-    from ssmail.figures import FIGURES
-    from ssmail.spec_keys import unknown_name
+    from ssmail.config.keys import unknown_name
+    from ssmail.paper.results import FIGURES
     from ssmail.store import RunState
 
     if state is not None and state not in list(RunState):

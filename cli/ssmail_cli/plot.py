@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.figures import FigureModule, FigureRecord
+    from ssmail.paper.results import FigureModule
+    from ssmail.plots import FigureRecord
     from ssmail.store import RunRow, Store
 
 SKELETON = "skeleton"
@@ -106,7 +107,7 @@ def plot(
     the paths of the files. `all` draws the paper's figures as far as their runs are stored, tells of the others what
     makes their runs, and ends with exit code 3 when there are any.
     """
-    from ssmail.figures import FIGURES
+    from ssmail.paper.results import FIGURES
 
     ids = [part for text in runs or [] for part in text.split(",") if part] or None
     _check_figures(figures)
@@ -173,8 +174,8 @@ def _check_runs(names: Sequence[str], ids: Sequence[str] | None, profile: str | 
 
 def _check_figures(figures: Sequence[str]) -> None:
     """Refuse unknown names."""
-    from ssmail.figures import FIGURES
-    from ssmail.spec_keys import unknown_name
+    from ssmail.config.keys import unknown_name
+    from ssmail.paper.results import FIGURES
 
     for name in figures:
         others = (ALL, TRAINING, SKELETON, *OF_A_RUN)
@@ -193,7 +194,7 @@ def _check_owner(owners: Sequence[str], options: Mapping[str, object], figures: 
 
 def _stem(module: "FigureModule", environment: str | None) -> str:
     """The files' name without ending; of another environment than the paper's it names that."""
-    from ssmail.experiments import figure_requirements
+    from ssmail.config.experiments import figure_requirements
 
     if environment in (None, figure_requirements(module.name).environment):
         return module.stem
@@ -208,8 +209,8 @@ def _chosen(
     profile: str | None,
 ) -> "list[RunRow]":
     """The runs that meet every condition, newest last. Raises InputError when there is none, or an unknown name."""
-    from ssmail.experiments_file import load_experiments
-    from ssmail.spec_keys import unknown_name
+    from ssmail.config.experiments_file import load_experiments
+    from ssmail.config.keys import unknown_name
 
     runs = store.runs(ids=ids, environment=environment, profile=profile)
     for method in methods or []:
@@ -232,7 +233,7 @@ def _draw_training(
     formats: Sequence[str] | None,
 ) -> None:
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.figures import training_curves
+    from ssmail.plots import training_curves
 
     record = training_curves.collect(store, runs, metrics, group_by or DEFAULT_GROUPS, statistic or Statistic.MEAN_STD)
     _save(TRAINING, record.stem, record, training_curves.draw(record), out, formats)
@@ -240,7 +241,7 @@ def _draw_training(
 
 def _draw_run(name: str, run: str, epoch: int | None, store: "Store", out: Path, formats: Sequence[str] | None) -> None:
     """The landscape of a run, or the film of its landscapes."""
-    from ssmail.figures import landscape_film
+    from ssmail.plots import landscape_film
 
     record = landscape_film.collect(store, run, name, epoch)
     if name == landscape_film.LANDSCAPE:
@@ -254,7 +255,7 @@ def _draw_run(name: str, run: str, epoch: int | None, store: "Store", out: Path,
 def _draw_skeleton(
     data: Path, split: str, window: int, animate: bool, out: Path, formats: Sequence[str] | None
 ) -> None:
-    from ssmail.figures import skeleton
+    from ssmail.plots import skeleton
 
     record = skeleton.collect(data, split, window)
     _save(SKELETON, record.stem, record, skeleton.draw(record), out, formats)
@@ -268,7 +269,7 @@ def _save(
     name: str, stem: str, record: "FigureRecord", figure: "Figure", out: Path, formats: Sequence[str] | None
 ) -> None:
     """Write the files, tell the notes on stderr and the paths on stdout."""
-    from ssmail.figures.saving import save_figure
+    from ssmail.plots.saving import save_figure
 
     for remark in record.notes:
         note(f"{name}: {remark}")

@@ -11,7 +11,7 @@ from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, Stat, c
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 
 if TYPE_CHECKING:
-    from ssmail.report.drawing import Drawn
+    from ssmail.paper.report.drawing import Drawn
     from ssmail.store import Store
 
 
@@ -49,9 +49,9 @@ def write_report(
     unfinished: Sequence[str] = (),
 ) -> None:
     """Judge the claims and write report.md and report.html beside the folder of the figures; print their paths."""
-    from ssmail.evidence import judge
-    from ssmail.report.contents import gather
-    from ssmail.report.pages import write
+    from ssmail.paper.judgement import judge
+    from ssmail.paper.report.contents import gather
+    from ssmail.paper.report.pages import write
 
     contents = gather(store, figures, judge(store, profile), command, unfinished)
     for path in write(contents, out.parent):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError
-from ssmail.report.wording import duration
+from ssmail.plots.formatting import duration
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
 from ssmail_cli.drawing import draw_or_tell, undrawn
@@ -20,10 +20,10 @@ from ssmail_cli.sweep import SOME_RUNS_FAILED, Rows, compute, finish, is_interru
 from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
 
 if TYPE_CHECKING:
+    from ssmail.config.spec import RunSpec
     from ssmail.evaluation.statistics import Statistic
     from ssmail.execution.local import Cell
-    from ssmail.report.drawing import Drawn
-    from ssmail.spec import RunSpec
+    from ssmail.paper.report.drawing import Drawn
     from ssmail.store import RunRow, Store
 
 FAILURE = 1
@@ -125,10 +125,10 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
+    from ssmail.config.experiments_file import load_experiments
+    from ssmail.config.keys import unknown_name
     from ssmail.execution.figure_cells import figure_cells
-    from ssmail.experiments_file import load_experiments
-    from ssmail.figures import FIGURES
-    from ssmail.spec_keys import unknown_name
+    from ssmail.paper.results import FIGURES
 
     listed = load_experiments().figures
     choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}

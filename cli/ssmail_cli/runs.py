@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError
-from ssmail.report.wording import counted
+from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
 from ssmail_cli.results import rows_with_metrics, run_row, shown_on
@@ -207,7 +207,7 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The same, flat: section, name, step (of a metric), value."""
-    from ssmail.spec_keys import leaves
+    from ssmail.config.keys import leaves
 
     for section in ("run", "spec"):
         for name, value in leaves(details[section]):

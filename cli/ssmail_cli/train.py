@@ -27,8 +27,8 @@ def train(
 
     A run is its spec and its seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops.
     """
+    from ssmail.config.experiments import build_spec
     from ssmail.execution.local import Cell
-    from ssmail.experiments import build_spec
 
     chosen_seeds = parse_seeds(seeds)
     spec = build_spec(method, environment, profile, settings or [])

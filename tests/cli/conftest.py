@@ -14,7 +14,7 @@ from ssmail.store import RunState, Store
 from ssmail_cli.main import run
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
-from tests.figures.handmade_arrays import arrays
+from tests.paper.handmade_arrays import arrays
 
 SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
 

@@ -12,10 +12,10 @@ from hypothesis import given as drawn
 from hypothesis import settings
 from hypothesis import strategies as st
 
+from ssmail.config.experiments import ablation, ablation_specs
+from ssmail.config.experiments_file import load_experiments
 from ssmail.errors import InputError
 from ssmail.execution.local import Resume
-from ssmail.experiments import ablation, ablation_specs
-from ssmail.experiments_file import load_experiments
 from ssmail.store import Store
 from ssmail_cli.ablate import parse_values
 from ssmail_cli.progress import FEW
@@ -186,7 +186,7 @@ def test_on_a_terminal_the_figure_is_named(
 ) -> None:
     fake()
     options = (*SMOKE, "--values", "0.5", "--seeds", "0", "--db", db)
-    monkeypatch.setattr("ssmail.figures.FIGURES", {"fig6": None})
+    monkeypatch.setattr("ssmail.paper.results.FIGURES", {"fig6": None})
     assert "ssmail plot" not in cli(*options).err
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     assert f"`ssmail plot fig6 --db {db}` draws these runs" in cli(*options).err

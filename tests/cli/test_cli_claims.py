@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import ablation_specs
+from ssmail.config.experiments import ablation_specs
 from ssmail.store import RunState, Store
 from tests.cli.command_line import CommandLine
 

@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.data import expert_file, letters, yjunction
 from ssmail.evaluation.statistics import Statistic
-from ssmail.experiments import build_spec
-from ssmail.figures import FIGURES, provenance
+from ssmail.paper.results import FIGURES
+from ssmail.plots import provenance
 from ssmail.store import RunState, Store
 from tests.cli.command_line import CommandLine
-from tests.figures.handmade_arrays import arrays
+from tests.paper.handmade_arrays import arrays
 
 
 @pytest.fixture

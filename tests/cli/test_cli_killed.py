@@ -16,7 +16,7 @@ import pytest
 from ssmail.execution.cells import Cell, Event, Settings
 from ssmail.execution.single import run_cell
 from ssmail.store import Store
-from ssmail.store.checks import check
+from ssmail.store.maintenance.checks import check
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine
 from tests.cli.test_cli_reproduce import needs

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import build_spec, figure_requirements
-from ssmail.experiments_file import load_experiments
-from ssmail.figures import FIGURES
+from ssmail.config.experiments import build_spec, figure_requirements
+from ssmail.config.experiments_file import load_experiments
+from ssmail.paper.results import FIGURES
 from ssmail.store import RunState, Store
 from tests.cli.command_line import CommandLine
-from tests.figures.handmade_arrays import arrays
-from tests.figures.handmade_landscapes import landscapes, linear
+from tests.paper.handmade_arrays import arrays
+from tests.paper.handmade_landscapes import landscapes, linear
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_all_ends_well_when_nothing_is_missing(
     cli: CommandLine, run: str, where: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = {name: module for name, module in FIGURES.items() if module.name in ("fig4", "fig9")}
-    monkeypatch.setattr("ssmail.figures.FIGURES", there)
+    monkeypatch.setattr("ssmail.paper.results.FIGURES", there)
     outcome = cli("plot", "all", "--stat", "mean-ci", *where)
     assert (outcome.code, "is not drawn" in outcome.err) == (0, False)
 

@@ -7,13 +7,14 @@ from typing import Any
 
 import pytest
 
-from ssmail.evidence.collectors import COLLECTORS
 from ssmail.execution.figure_cells import figure_cells
-from ssmail.figures import FIGURES, provenance
+from ssmail.paper.collectors import COLLECTORS
+from ssmail.paper.results import FIGURES
+from ssmail.plots import provenance
 from ssmail.store import Store
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
 from tests.data.mocap.handmade import write_subject
-from tests.figures.handmade_arrays import forecasts
+from tests.paper.handmade_arrays import forecasts
 
 SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
 LEFT_OUT = (
@@ -42,7 +43,7 @@ def plan(outcome: Outcome) -> dict[str, tuple[int, int, int]]:
 
 def needs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, **figures: list[str]) -> None:
     """Let figures need the runs of these methods alone, so that they can be drawn from little."""
-    from ssmail.experiments_file import load_experiments
+    from ssmail.config.experiments_file import load_experiments
 
     head = load_experiments().path.read_text().partition("\nfigures:\n")[0]
     entries = [f"  {name}: {{environment: yjunction, methods: {methods}}}" for name, methods in figures.items()]

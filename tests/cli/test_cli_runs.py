@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.store import RunState, Store
 from ssmail_cli.results import SHOWN
 from tests.cli.command_line import CommandLine

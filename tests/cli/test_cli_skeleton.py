@@ -6,7 +6,7 @@ import pytest
 
 from ssmail.data import expert_file
 from ssmail.data.mocap.dataset import MocapParameters, prepare
-from ssmail.figures import skeleton
+from ssmail.plots import skeleton
 from tests.cli.command_line import CommandLine
 from tests.data.mocap.handmade import write_subject
 

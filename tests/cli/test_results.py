@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import build_spec
-from ssmail.spec import ENVIRONMENTS
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import ENVIRONMENTS
 from ssmail.training.loop import TrainingLoop
 from ssmail_cli.progress import LABELS
 from ssmail_cli.results import SHOWN, key_metrics, shown_on

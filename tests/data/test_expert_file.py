@@ -7,11 +7,11 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data import expert_file, yjunction
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.data.trajectories import ExpertSet
 from ssmail.errors import InputError
-from ssmail.spec_sections import YJunctionSpec
 from tests.data.mocap.handmade import write_subject
 
 PARAMS = YJunctionSpec(train=4, validation=3, test=2, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0)

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import MOST_LETTERS, LettersSpec
 from ssmail.data import letters, pen
-from ssmail.experiments import build_spec
-from ssmail.spec_sections import MOST_LETTERS, LettersSpec
 
 
 def params(**changes: object) -> LettersSpec:

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data import yjunction
 from ssmail.errors import InputError
-from ssmail.spec_sections import YJunctionSpec
 
 
 def params(**changes: object) -> YJunctionSpec:

@@ -2,11 +2,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data.scaling import Scaling
 from ssmail.data.yjunction import generate
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.self_supervision import mix
-from ssmail.spec_sections import YJunctionSpec
 
 INTEGRATOR = Integrator(Scaling(-20.0, 45.0, -0.7, 1.1))
 

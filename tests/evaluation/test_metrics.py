@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data.yjunction import generate
 from ssmail.evaluation import metrics
 from ssmail.evaluation.protocol import full_metrics, one_step_mse, quick_metrics
-from ssmail.spec_sections import YJunctionSpec
 
 PARAMS = YJunctionSpec(train=30, validation=1, test=20, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
 EXPERTS = generate(PARAMS)

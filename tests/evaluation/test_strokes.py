@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from ssmail.config.sections import LettersSpec
 from ssmail.data import letters
 from ssmail.data.trajectories import Floats
 from ssmail.evaluation.strokes import polyline_distances, stroke_distances
-from ssmail.spec_sections import LettersSpec
 
 BAR = np.stack([np.linspace(0, 1, 101), np.zeros(101)], axis=1)  # a stroke of length 1
 

@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.execution.cells import Cell
-from ssmail.experiments import build_spec
 
 
 @pytest.fixture

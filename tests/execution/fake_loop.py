@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ssmail.spec import RunSpec
+from ssmail.config.spec import RunSpec
 from ssmail.training.loop import Divergence
 
 

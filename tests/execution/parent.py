@@ -2,8 +2,8 @@
 
 import sys
 
+from ssmail.config.experiments import build_spec
 from ssmail.execution.local import Cell, Event, run_cells
-from ssmail.experiments import build_spec
 
 
 def tell(event: Event) -> None:

@@ -5,11 +5,11 @@ import json
 
 import pytest
 
+from ssmail.config.experiments import ablation, build_spec
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError
 from ssmail.execution.cells import Cell
 from ssmail.execution.figure_cells import estimated_seconds, figure_cells, longest_first, total_seconds
-from ssmail.experiments import ablation, build_spec
-from ssmail.spec import RunSpec
 from ssmail.store import RunRow, Store
 
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.data.expert_file import save
 from ssmail.data.yjunction import generate
 from ssmail.execution import single
 from ssmail.execution.cells import Cell, Event, Job, Resume, Settings
 from ssmail.execution.single import run_cell
-from ssmail.experiments import build_spec
 from ssmail.store import RunState, RunWriter, Store
 from tests.execution.fake_loop import Walk
 from tests.execution.recorded import recorded

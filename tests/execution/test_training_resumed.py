@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.execution.local import Cell, Event, run_cells
-from ssmail.experiments import build_spec
 from ssmail.store import Store
 from tests.execution.disturbed_training import LAST_EPOCH
 from tests.execution.recorded import recorded

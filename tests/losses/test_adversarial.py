@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.losses.adversarial import gail_loss, gradient_penalty, wail_loss
-from ssmail.rewards import gail_reward, ssail_reward, wail_reward
+from ssmail.losses.rewards import gail_reward, ssail_reward, wail_reward
 
 
 def outputs(*values: float) -> torch.Tensor:

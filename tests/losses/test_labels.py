@@ -8,10 +8,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.errors import InputError
-from ssmail.experiments import build_spec
 from ssmail.losses.labels import LabelFunction, checked_label, piecewise_linear
-from ssmail.spec_sections import used
 
 ALPHAS = torch.tensor([-1.0, -0.25, 0.0, 0.5, 1.0, 1.25, 1.5])
 finite = st.floats(-50, 50)

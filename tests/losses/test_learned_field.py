@@ -11,12 +11,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.losses.adversarial import ssail_loss
 from ssmail.losses.labels import checked_label, label_function
 from ssmail.losses.self_supervision import mix, sample_alpha
 from ssmail.models.discriminator import Discriminator
-from ssmail.spec_sections import used
 
 STEPS, BATCH, TRANSITIONS = 500, 64, 2
 TOLERANCE = 0.12  # of D along the segment, where labels go from -1 to 1.5

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.models.features import Features
-from ssmail.spec_sections import used
 
 
 def whole(*shape: int, seed: int = 0) -> Tensor:

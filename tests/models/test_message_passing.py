@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ssmail.config.sections import ModelSpec
 from ssmail.models import message_passing
 from ssmail.models.actor import Actor
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.graph_encoder import GraphEncoder, off_diagonal, on_diagonal
 from ssmail.models.message_passing import DENSE_UP_TO, EdgeFunction, SumOverSenders, TypedMessages, sum_over_senders
-from ssmail.spec_sections import ModelSpec
 
 SPEC = ModelSpec(
     hidden=8,

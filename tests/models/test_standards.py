@@ -4,10 +4,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.models.actor import Actor
 from ssmail.models.standards import FARTHEST, SMALLEST, Reach, Standards
-from ssmail.spec_sections import used
 from tests.models.test_message_passing import SPEC, one_hot_graph
 
 USUAL = Standards(torch.tensor([[10.0, 1.0], [0.0, -2.0]]), torch.tensor([[2.0, 0.5], [1.0, 4.0]]))

@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from ssmail.config.sections import VariationalSpec
 from ssmail.models.decoders import make_decoder
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
-from ssmail.spec_sections import VariationalSpec
 
 SPEC = VariationalSpec(
     root_relative=False,

@@ -9,9 +9,9 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from ssmail.evidence import judge
-from ssmail.figures import FIGURES
-from ssmail.figures.saving import csv_text
+from ssmail.paper.judgement import judge
+from ssmail.paper.results import FIGURES
+from ssmail.plots.saving import csv_text
 from ssmail.store import Store
 
 ROOT = Path(__file__).parents[2]

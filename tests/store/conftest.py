@@ -1,7 +1,7 @@
 import pytest
 
-from ssmail.experiments import build_spec
-from ssmail.spec import RunSpec
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
 from ssmail.store import RunWriter, Store
 
 

@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.store import RunState, Store, connection
 
 

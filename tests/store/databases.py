@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.store import RunState, Store
 
 SPEC = build_spec("ssail", "yjunction", "smoke")

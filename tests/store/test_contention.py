@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ssmail.spec import RunSpec
+from ssmail.config.spec import RunSpec
 from ssmail.store import RunState, Store
 
 PROCESSES, RUNS, EPOCHS, METRICS = 8, 2, 15, 20
@@ -56,7 +56,7 @@ def test_without_waiting_they_would_meet_locks(tmp_path: Path) -> None:
 
 CLAIM = """
 import sys
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.store import Store
 store, spec = Store.open(sys.argv[1]), build_spec("ssail", "yjunction", "smoke")
 print("ready", flush=True)

@@ -4,9 +4,9 @@ from typing import Any
 
 import pytest
 
+from ssmail.config.experiments import FigureRequirements, ablation_specs, build_spec
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError
-from ssmail.experiments import FigureRequirements, ablation_specs, build_spec
-from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store
 
 
@@ -47,7 +47,7 @@ def test_unknown_and_ambiguous_ids(store: Store, spec: RunSpec) -> None:
 def test_a_figure_keeps_only_its_methods(store: Store, spec: RunSpec, monkeypatch: pytest.MonkeyPatch) -> None:
     store.start_run(spec, 0, dataset_hash=None, device="cpu")
     required = FigureRequirements("yjunction", ("gail",))
-    monkeypatch.setattr("ssmail.experiments.figure_requirements", lambda name: required)
+    monkeypatch.setattr("ssmail.config.experiments.figure_requirements", lambda name: required)
     assert store.runs(figure="fig4") == []
 
 

@@ -16,8 +16,8 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import create_engine, event
 
 import ssmail.store
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
-from ssmail.spec import RunSpec
 from ssmail.store import RunState, Store, connection
 from ssmail.store.schema import REVISIONS, metadata
 

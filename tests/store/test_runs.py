@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
-from ssmail.spec import RunSpec
 from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive
 
 NOT_FINITE = {"nan": math.nan, "up": math.inf, "down": -math.inf}

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.experiments import build_spec
-from ssmail.spec import RunSpec
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
 from tests.data.mocap.handmade import write_set
 
 ToySpec = Callable[..., RunSpec]

@@ -1,8 +1,8 @@
 import pytest
 import torch
 
-from ssmail.experiments import build_spec
-from ssmail.spec_sections import used
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.loop import TrainingLoop
 

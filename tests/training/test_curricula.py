@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.spec_sections import CurriculumSpec
+from ssmail.config.sections import CurriculumSpec
 from ssmail.training.curricula import (
     curriculum_metrics,
     draw_interventions,

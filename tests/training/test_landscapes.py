@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
 from ssmail.models.features import Features
 from ssmail.models.standards import Standards
-from ssmail.spec import RunSpec
 from ssmail.training import landscapes
 from ssmail.training.landscapes import Landscapes, Moments, current_epoch, looks, position_gradient
 from ssmail.training.learning import Setting

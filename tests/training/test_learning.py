@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.spec import METHODS
+from ssmail.config.spec import METHODS
 from ssmail.training.learning import Predictor
 from ssmail.training.loop import TrainingLoop
 from tests.training.conftest import ToySpec

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from ssmail.experiments import build_spec
-from ssmail.spec import METHODS, RunSpec
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import METHODS, RunSpec
 from ssmail.training.loop import TrainingLoop
 
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import METHODS, RunSpec
 from ssmail.errors import InputError
-from ssmail.experiments import build_spec
-from ssmail.spec import METHODS, RunSpec
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.curricula import mean_segment_length
 from ssmail.training.loop import Divergence, TrainingLoop

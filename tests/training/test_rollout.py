@@ -6,12 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from ssmail.config.experiments import build_spec
+from ssmail.config.sections import used
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
-from ssmail.experiments import build_spec
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
-from ssmail.spec_sections import used
 from ssmail.training.rollout import Rollout, rollout
 
 INTEGRATOR = Integrator(Scaling(-20.0, 45.0, -0.7, 1.1))

@@ -5,7 +5,7 @@ from copy import deepcopy
 import pytest
 import torch
 
-from ssmail.experiments import build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.training.loop import TrainingLoop
 from ssmail.training.variational import VariationalLearner
 

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ssmail.config.sections import LettersSpec, YJunctionSpec
 from ssmail.data import letters
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.data.yjunction import LANES, make_expert_set
 from ssmail.errors import InputError
-from ssmail.spec_sections import LettersSpec, YJunctionSpec
 
 Contents = Mapping[str, Any]
 

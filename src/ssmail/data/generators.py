@@ -1,12 +1,12 @@
 """The environments that make their own expert sets."""
 
+from ssmail.config.sections import DataSpec
 from ssmail.data import letters, yjunction
 from ssmail.data.trajectories import ExpertSet
-from ssmail.spec_sections import DataSpec
 
 
 def generate(data: DataSpec) -> ExpertSet:
-    """The expert set of the environment whose parameters `data` has: one of ssmail.spec.GENERATED.
+    """The expert set of the environment whose parameters `data` has: one of ssmail.config.spec.GENERATED.
 
     Raises InputError for parameters that no set can have.
     """

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ssmail import strict_yaml
+from ssmail.config import strict_yaml
+from ssmail.config.sections import LettersSpec
 from ssmail.data.pen import Timeline, along, approach, arc_lengths, progress
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
-from ssmail.spec_sections import LettersSpec
 
 WIDTH, GAP = 0.8, 0.4  # of a letter and between letters
 START = np.array([0.2, -0.55])  # where a pen begins, from the lower left corner of its letter

@@ -12,9 +12,9 @@ import json
 
 import numpy as np
 
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError
-from ssmail.spec_sections import YJunctionSpec
 
 LANES = (1.0, -1.0)  # sign of y: lane 0 bends to +y, lane 1 to -y
 FORK = 0.3  # where the lanes part, as a fraction of the number of steps

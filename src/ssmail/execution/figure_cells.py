@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
+from ssmail.config.experiments import ablation, ablation_specs, as_written, build_spec, figure_requirements
+from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
-from ssmail.experiments import ablation, ablation_specs, as_written, build_spec, figure_requirements
-from ssmail.spec import RunSpec
 from ssmail.store import RunRow
 
 

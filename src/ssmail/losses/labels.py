@@ -13,11 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ssmail.config.experiments import function_folders
+from ssmail.config.sections import SelfSupervisionSpec
+from ssmail.config.shaping import Knots
+from ssmail.config.user_functions import UserFunction, load, told
 from ssmail.errors import InputError
-from ssmail.experiments import function_folders
-from ssmail.shaping import Knots
-from ssmail.spec_sections import SelfSupervisionSpec
-from ssmail.user_functions import UserFunction, load, told
 
 LabelFunction = Callable[[Tensor], Tensor]
 

@@ -7,9 +7,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import ModelSpec
 from ssmail.models.message_passing import TypedMessages, perceptron
 from ssmail.models.standards import Reach
-from ssmail.spec_sections import ModelSpec
 
 EDGE = 0.999  # of the action's range: where log_prob takes actions at the edge to be (atanh is exact to 1e-4 there)
 

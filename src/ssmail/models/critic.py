@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import ModelSpec
 from ssmail.models.message_passing import TypedMessages
-from ssmail.spec_sections import ModelSpec
 
 
 class TwinLinear(nn.Module):

@@ -11,10 +11,10 @@ first; their diagonal is ignored, and T may be 1: one graph for all steps.
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import VariationalSpec
 from ssmail.models.edge_layers import RELU, TANH, Activation, EdgeLayers
 from ssmail.models.graph_encoder import off_diagonal
 from ssmail.models.message_passing import PairLayer
-from ssmail.spec_sections import VariationalSpec
 
 
 class PairPerceptron(nn.Module):

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ssmail.config.sections import ModelSpec, VariationalSpec
 from ssmail.models.standards import Standards
-from ssmail.spec_sections import ModelSpec, VariationalSpec
 
 
 @dataclass(frozen=True)

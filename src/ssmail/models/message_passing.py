@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ssmail.spec_sections import ModelSpec
+from ssmail.config.sections import ModelSpec
 
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

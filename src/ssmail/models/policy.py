@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import ModelSpec
 from ssmail.models.actor import Actor
 from ssmail.models.graph_encoder import GraphEncoder, GraphNoise, Memory, sample_graph
 from ssmail.models.standards import Reach
-from ssmail.spec_sections import ModelSpec
 
 
 class GraphPolicy(nn.Module):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ssmail.spec_sections import ModelSpec
+from ssmail.config.sections import ModelSpec
 
 SMALLEST = 0.1  # of the mean spread: what hardly moves is not blown up beyond this
 

@@ -13,11 +13,11 @@ All logits are (B, T, N, N, K), sender first, and zero on the diagonal, where th
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import VariationalSpec
 from ssmail.models.edge_layers import CHUNK
 from ssmail.models.edge_memory import both_ways
 from ssmail.models.edge_perceptron import EdgePerceptron, NodePerceptron, ScaledEdges, edge_graph
 from ssmail.models.graph_encoder import Memory, remember
-from ssmail.spec_sections import VariationalSpec
 
 
 def edge_type_head(inputs: int, spec: VariationalSpec) -> nn.Sequential:

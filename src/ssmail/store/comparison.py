@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssmail.spec_keys import leaves
+from ssmail.config.keys import leaves
 from ssmail.store.queries import RunRow
 from ssmail.store.run_store import Store
 from ssmail.store.schema import RunState

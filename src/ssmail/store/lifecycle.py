@@ -7,8 +7,8 @@ from typing import Any
 
 from sqlalchemy import Connection, delete, func, insert, select, update
 
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
-from ssmail.spec import RunSpec
 from ssmail.store import queries, schema
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import RunState

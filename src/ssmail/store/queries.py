@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, Select, select
 
+from ssmail.config.spec import completed
 from ssmail.errors import InputError
-from ssmail.spec import completed
 from ssmail.store import arrays, schema
 from ssmail.store.schema import RunState
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy.typing as npt
 from sqlalchemy import Engine
 
-from ssmail.spec import RunSpec
+from ssmail.config.spec import RunSpec
 from ssmail.store import lifecycle, origin, queries, schema
 from ssmail.store.checkpoint_files import root_of
 from ssmail.store.connection import connect, describe, reading, writing
@@ -71,7 +71,7 @@ class Store:
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}
         conditions = [column == value for column, value in equal.items() if value is not None]
         if figure is not None:
-            from ssmail.experiments import ablation_hashes, figure_requirements
+            from ssmail.config.experiments import ablation_hashes, figure_requirements
 
             needed = figure_requirements(figure)
             conditions += [run.c.environment == needed.environment, run.c.method.in_(list(needed.methods))]

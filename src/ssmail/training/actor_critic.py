@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ssmail.config.sections import SacSpec
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
 from ssmail.models.critic import TwinCritic
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import graph_entropy
 from ssmail.models.policy import GraphPolicy
-from ssmail.spec_sections import SacSpec
 from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
 from ssmail.training.updates import clipped_step

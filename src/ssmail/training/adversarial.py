@@ -10,16 +10,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import Pairing, SelfSupervisionSpec, used
 from ssmail.losses.adversarial import Terms, gail_loss, gradient_penalty, ssail_loss, wail_loss
 from ssmail.losses.labels import checked_label
+from ssmail.losses.rewards import gail_reward, ssail_reward, wail_reward
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.models.standards import Reach
-from ssmail.rewards import gail_reward, ssail_reward, wail_reward
-from ssmail.spec_sections import Pairing, SelfSupervisionSpec, used
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learning import Setting

@@ -5,10 +5,10 @@ from typing import Any
 import torch
 from torch import nn
 
+from ssmail.config.sections import used
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.models.standards import Reach
-from ssmail.spec_sections import used
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.policy_predictor import PolicyPredictor

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from ssmail.spec_sections import CurriculumSpec
+from ssmail.config.sections import CurriculumSpec
 
 
 def intervention_frequency(spec: CurriculumSpec, epoch: int, epochs: int) -> float:

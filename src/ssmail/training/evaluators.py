@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssmail.config.sections import used
+from ssmail.config.spec import RunSpec
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 from ssmail.evaluation.protocol import forecast_metrics, full_metrics, letter_metrics, one_step_mse, quick_metrics
-from ssmail.spec import RunSpec
-from ssmail.spec_sections import used
 from ssmail.training.experts import as_doubles, scaled_batch
 from ssmail.training.learning import Predictor, Setting
 from ssmail.training.references import ConstantVelocity, CopyLast

@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssmail.config.spec import RunSpec
 from ssmail.evaluation.landscape import Plane, closeness, mean_cosine, nearest_points, slope_share
 from ssmail.losses.self_supervision import mix, nearest
 from ssmail.models.features import Features
-from ssmail.spec import RunSpec
 from ssmail.training.experts import as_doubles
 from ssmail.training.learning import Learner, Predictor, Setting
 

@@ -7,8 +7,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.spec import RunSpec
 from ssmail.envs.integrator import Integrator
-from ssmail.spec import RunSpec
 from ssmail.training.replay import Batch
 from ssmail.training.seeding import Generators
 

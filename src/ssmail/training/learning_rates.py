@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import torch
 
-from ssmail.spec_sections import TrainingSpec
+from ssmail.config.sections import TrainingSpec
 
 
 class DecayingRates:

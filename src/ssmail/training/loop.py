@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from ssmail.config.spec import RunSpec
 from ssmail.data.expert_file import load
 from ssmail.data.generators import generate
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
-from ssmail.spec import RunSpec
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.experts import scaled_batch
 from ssmail.training.landscapes import Landscapes, looks

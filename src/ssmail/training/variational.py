@@ -12,13 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.sections import VariationalSpec, used
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
-from ssmail.spec_sections import VariationalSpec, used
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from pydantic import Field, ValidationError
 
+from ssmail.config.sections import Frozen
 from ssmail.errors import InputError, SsmailError
-from ssmail.spec_sections import Frozen
 
 RECORD = "downloads.json"
 

@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from ssmail.config.sections import Frozen
 from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions
 from ssmail.data.mocap.lines import AGAIN
@@ -26,7 +27,6 @@ from ssmail.data.mocap.source import Source, find_subject, open_source, shown
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError
-from ssmail.spec_sections import Frozen
 
 SPLITS = ("train", "validation", "test")
 MOST_TRIALS = 1000

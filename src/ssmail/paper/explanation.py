@@ -1,0 +1,150 @@
+"""What a saved figure is drawn from, and whether a database still says the same."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from ssmail.errors import InputError
+from ssmail.evaluation.statistics import Statistic
+from ssmail.paper.results import FIGURES
+from ssmail.plots import provenance, training_curves
+from ssmail.plots.provenance import Provenance, RunSource
+from ssmail.plots.saving import csv_text, digest
+from ssmail.store import RunRow, Store
+
+ENDINGS = (".png", ".pdf", ".svg", ".gif")
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """A figure's origin. csv: where its CSV is or was; csv_state: as written, altered, missing, or None: not known."""
+
+    path: Path
+    provenance: Provenance
+    csv: Path
+    csv_state: str | None
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What a database says of a figure.
+
+    runs: by run id "same", "missing", or what has changed. values: "same", "different", or None where they cannot be
+    compared. reason: where they differ first, or why they cannot be compared.
+    """
+
+    where: str
+    runs: dict[str, str]
+    values: str | None
+    reason: str | None
+
+    @property
+    def agrees(self) -> bool | None:
+        """Whether all runs are as they were and give the same values; None where the values cannot be compared."""
+        if any(state != "same" for state in self.runs.values()) or self.values == "different":
+            return False
+        return True if self.values == "same" else None
+
+
+def explain(path: Path) -> Explanation:
+    """The origin of a figure, or of the figure that a CSV was written with.
+
+    Raises InputError for what is no figure of ssmail's, and for a CSV without its figure beside it.
+    """
+    if path.suffix.lower() == ".csv":
+        return _of_csv(path)
+    source = provenance.read(path)
+    csv = path.with_suffix(".csv")
+    return Explanation(path, source, csv, _csv_state(csv, source))
+
+
+def compare(explanation: Explanation, store: Store) -> Agreement:
+    """Whether the store holds the same runs, and whether the figure collected from them again shows the same values."""
+    source = explanation.provenance
+    stored = {run.id: run for run in store.runs()}
+    runs = {run_id: _run_state(run_id, source.runs, stored) for run_id in source.run_ids}
+    missing = sum(state == "missing" for state in runs.values())
+    if not runs:
+        return Agreement(store.where, runs, None, "it is drawn from an expert set, not from runs")
+    if missing:
+        return Agreement(store.where, runs, None, f"{missing} of its {len(runs)} runs are missing")
+    if source.csv_sha256 is None:
+        return Agreement(store.where, runs, None, "an older ssmail drew it, which kept no hash of what it shows")
+    try:
+        table = _collect_again(source, store)
+    except (InputError, TypeError) as error:
+        return Agreement(store.where, runs, None, str(error).rstrip("."))
+    text = csv_text(table)
+    if digest(text) == source.csv_sha256:
+        return Agreement(store.where, runs, "same", None)
+    return Agreement(store.where, runs, "different", _first_difference(explanation, text))
+
+
+def _of_csv(path: Path) -> Explanation:
+    if not path.is_file():
+        raise InputError(f"{path} cannot be read: there is no such file.")
+    for ending in ENDINGS:
+        figure = path.with_suffix(ending)
+        if figure.exists():
+            source = provenance.read(figure)
+            return Explanation(figure, source, path, _csv_state(path, source))
+    raise InputError(f"{path} has no figure beside it that tells its runs; give the .png, .pdf or .svg it belongs to.")
+
+
+def _csv_state(csv: Path, source: Provenance) -> str | None:
+    if source.csv_sha256 is None:
+        return None
+    try:
+        text = csv.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        return "missing"
+    except (OSError, UnicodeDecodeError):
+        return "altered"
+    return "as written" if digest(text) == source.csv_sha256 else "altered"
+
+
+def _run_state(run_id: str, sources: Sequence[RunSource], stored: dict[str, RunRow]) -> str:
+    """Whether the store has the run as it was; of an older figure's runs nothing but the id is known."""
+    run = stored.get(run_id)
+    if run is None:
+        return "missing"
+    for source in sources:
+        if source.id == run_id:
+            pairs = {
+                "spec": (source.spec_hash, run.spec_hash),
+                "data": (source.dataset_hash, run.dataset_hash),
+                "state": (source.state, run.state.value),
+            }
+            changes = [f"{name} was {was}, is {now}" for name, (was, now) in pairs.items() if was != now]
+            return "; ".join(changes) or "same"
+    return "same"
+
+
+def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
+    """The table of the same figure, from the same runs, with the same options."""
+    options: dict[str, Any] = dict(source.options)
+    if "statistic" in options:
+        options["statistic"] = Statistic(options["statistic"])
+    if source.figure == training_curves.NAME:
+        return training_curves.collect(store, store.runs(ids=source.run_ids), **options).table()
+    if source.figure not in FIGURES:
+        raise InputError(f"this ssmail draws no figure {source.figure}")
+    module = FIGURES[source.figure]
+    if module.has_environment and source.runs:
+        options["environment"] = source.runs[0].environment
+    return module.collect(store, source.run_ids, **options).table()
+
+
+def _first_difference(explanation: Explanation, text: str) -> str:
+    """The first line that differs, where the CSV that was written with the figure is there to compare with."""
+    if explanation.csv_state != "as written":
+        return "the CSV that was written with it is not there to say where"
+    written = explanation.csv.read_bytes().decode("utf-8").splitlines()
+    for number, (was, now) in enumerate(zip_longest(written, text.splitlines(), fillvalue="nothing"), start=1):
+        if was != now:
+            return f"line {number} of {explanation.csv.name} was {was}, is {now}"
+    return "only the ends of lines differ"

@@ -1,0 +1,216 @@
+"""Figure 1 (sections 1, A.2): the reward over the plane, ideal and as gail and ssail learn it, for the task of Fig. 1a.
+
+(a) the task: rollouts of the untrained policy and trajectories of the expert; (b) the ideal reward
+(`ssmail.evaluation.landscape.ideal_reward`); (c) gail's and (d) ssail's reward after the last epoch of training, of one
+seed each, the one with the median slope share (the lower of two).
+At each point of the plane the agent is asked whose expert comes nearest to it; docs/paper.md says what stands for the
+other coordinates. Colours go from the lowest (0) to the highest (1) reward of each panel, with contour lines at tenths.
+
+The numbers of every seed are in the CSV and the notes: the stored metrics `landscape/slope_share` and
+`landscape/cosine`, after the last epoch and after the one of figure 2, and the slope share with other thresholds.
+
+Deviation: ssail is trained as A.2 says (alpha in [-1, 1.5], reward 0 above 1) where experiments.yaml says so for the
+environment, whichever it is.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ssmail.data.trajectories import Floats
+from ssmail.errors import InputError
+from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
+from ssmail.plots import landscape_grids, style
+from ssmail.plots.landscape_grids import Landscape
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import Selection, select
+from ssmail.store import RunRow, RunState, Store
+
+NAME = "fig1"
+SHARE, COSINE = "landscape/slope_share", "landscape/cosine"
+THRESHOLDS = (0.1, USABLE, 0.5)  # of the slope share, as fractions of the even slope; the metric has the second
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The numbers of one run, epoch by epoch."""
+
+    label: str
+    run: RunRow
+    values: pd.DataFrame  # epoch, slope_share, cosine; rising
+    shares: tuple[float, ...]  # after the last epoch, for THRESHOLDS
+
+    @property
+    def last(self) -> tuple[float, float]:
+        """Slope share and cosine after the last epoch; NaN for a run that diverged before any was measured."""
+        if not len(self.values):
+            return float("nan"), float("nan")
+        row = self.values.iloc[-1]
+        return float(row[SHARE]), float(row[COSINE])
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A panel with a learned reward."""
+
+    label: str
+    run: RunRow
+    landscape: Landscape
+    reward: Floats  # (H, W) from 0 to 1
+
+
+@dataclass(frozen=True, eq=False)
+class LandscapesRecord:
+    """Everything that figure 1 shows. Positions are in the environment's own units."""
+
+    untrained: Floats  # (R, T, N, 2)
+    ideal: Floats  # (H, W) from 0 to 1
+    shown: tuple[Shown, ...]  # gail first: in the order of the paper
+    measured: tuple[Measured, ...]
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    @property
+    def landscape(self) -> Landscape:
+        """The one whose plane and expert the task and the ideal are of."""
+        return self.shown[-1].landscape
+
+    def table(self) -> pd.DataFrame:
+        """[kind, label, run_id, seed, epoch, slope_share, cosine, threshold, trajectory, agent, step, x, y, reward].
+
+        kind: number (of a run after an epoch), share (with a threshold, after the last epoch), untrained, expert, ideal
+        or learned (of one point of the plane).
+        """
+        parts = [_number_rows(measured) for measured in self.measured]
+        parts += [landscape_grids.path_rows(self.untrained, kind="untrained", epoch=0)]
+        parts += [landscape_grids.path_rows(self.landscape.expert, kind="expert")]
+        parts += [landscape_grids.plane_rows(self.landscape, [("reward", self.ideal)], kind="ideal")]
+        for item in self.shown:
+            named = {"label": item.label, "run_id": item.run.id, "seed": item.run.seed, "epoch": item.landscape.epoch}
+            parts.append(landscape_grids.plane_rows(item.landscape, [("reward", item.reward)], kind="learned", **named))
+        columns = ["kind", "label", "run_id", "seed", "epoch", "slope_share", "cosine", "threshold"]
+        columns += ["trajectory", "agent", "step", "x", "y", "reward"]
+        table = pd.concat(parts, ignore_index=True).reindex(columns=columns)
+        return table.astype(dict.fromkeys(["seed", "epoch", "trajectory", "agent", "step"], "Int64"))
+
+
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> LandscapesRecord:
+    """The runs that `ssmail.plots.selection` chooses, or those of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without landscapes.
+    """
+    selection = select(store, NAME, runs, profile)
+    measured = _measured(store, selection)
+    order = sorted(dict.fromkeys(item.label for item in measured), key=lambda label: label.startswith("ssail"))
+    shown = [_shown(store, median_of([item for item in measured if item.label == label])) for label in order]
+    first = shown[-1]
+    return LandscapesRecord(
+        untrained=landscape_grids.read(store, first.run, landscape_grids.stored_epochs(store, first.run)[0]).rollouts,
+        ideal=landscape_grids.normalised(_ideal(first.landscape)),
+        shown=tuple(shown),
+        measured=measured,
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=(*selection.notes, *_notes(measured, shown)),
+    )
+
+
+def median_of(measured: Sequence[Measured]) -> Measured:
+    """The one with the median last slope share, the lower of two; one without a number counts as the lowest."""
+    ranked = sorted(measured, key=lambda item: (np.nan_to_num(item.last[0], nan=-1.0), item.run.seed))
+    return ranked[(len(ranked) - 1) // 2]
+
+
+def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
+    stored = store.metrics([run.id for run in selection.runs], names=[SHARE, COSINE])
+    wide = stored.pivot(index=["run_id", "step"], columns="name", values="value").reset_index()
+    wide = wide.reindex(columns=["run_id", "step", SHARE, COSINE])
+    found = []
+    for group in selection.groups:
+        for run in group.runs:
+            values = wide[wide["run_id"] == run.id].sort_values("step")
+            epochs = landscape_grids.stored_epochs(store, run)
+            if not len(values) and run.state is not RunState.DIVERGED:
+                raise InputError(f"run {run.name} ({run.state}) has no {SHARE} yet; leave it out or train it further.")
+            last = landscape_grids.read(store, run, epochs[-1])
+            found.append(Measured(group.label, run, values, tuple(last.share(usable) for usable in THRESHOLDS)))
+    return tuple(found)
+
+
+def _shown(store: Store, measured: Measured) -> Shown:
+    landscape = landscape_grids.read(store, measured.run, landscape_grids.stored_epochs(store, measured.run)[-1])
+    reward = landscape_grids.normalised(landscape.joined(landscape.reward))
+    return Shown(measured.label, measured.run, landscape, reward)
+
+
+def _ideal(landscape: Landscape) -> Floats:
+    """(H, W) in scaled units."""
+    plane = Plane(landscape.plane.x / landscape.unit, landscape.plane.y / landscape.unit)
+    agents = range(len(landscape.reward))
+    each = [ideal_reward(plane, landscape.expert[:, :, n] / landscape.unit) for n in agents]
+    return landscape.joined(np.stack(each))
+
+
+def _notes(measured: Sequence[Measured], shown: Sequence[Shown]) -> list[str]:
+    """Which seed is shown, and the numbers of all."""
+    notes = []
+    for item in shown:
+        of = [one for one in measured if one.label == item.label]
+        numbers = ", ".join(f"{one.last[0]:.2f} and {one.last[1]:.2f} (seed {one.run.seed})" for one in of)
+        notes.append(
+            f"{item.label}: after epoch {item.landscape.epoch} the slope share and the cosine are {numbers}; seed "
+            f"{item.run.seed} is shown, the median by slope share."
+        )
+    return notes
+
+
+def _number_rows(measured: Measured) -> pd.DataFrame:
+    named: dict[str, Any] = {"label": measured.label, "run_id": measured.run.id, "seed": measured.run.seed}
+    columns = {"step": "epoch", SHARE: "slope_share", COSINE: "cosine"}
+    numbers = measured.values[list(columns)].rename(columns=columns).assign(kind="number", threshold=USABLE, **named)
+    last = int(numbers["epoch"].max()) if len(numbers) else 0
+    shares = {"threshold": THRESHOLDS, "slope_share": measured.shares}
+    return pd.concat([numbers, pd.DataFrame({"kind": "share", "epoch": last, **named, **shares})])
+
+
+def draw(record: LandscapesRecord) -> Figure:
+    """Panels in two columns, one scale for all colours and lengths; a colour bar and the legend below and above."""
+    panels = 2 + len(record.shown)
+    rows = (panels + 1) // 2
+    with style.sheet():
+        figure = style.new_figure(height=0.9 + rows * (landscape_grids.height(record.landscape, 1.45) + 0.2))
+        grid = figure.subplots(rows, 2, sharex=True, sharey=True, squeeze=False).ravel()
+        for axes in grid[panels:]:
+            axes.set_axis_off()
+        _draw_task(grid[0], record)
+        images = [landscape_grids.draw_reward(grid[1], record.landscape, record.ideal)]
+        _title(grid[1], 1, "ideal reward")
+        for place, item in enumerate(record.shown, start=2):
+            images.append(landscape_grids.draw_reward(grid[place], item.landscape, item.reward))
+            _title(grid[place], place, f"{item.label}, seed {item.run.seed}, epoch {item.landscape.epoch}")
+        landscape_grids.label_axes(list(grid[:panels]), 2, record.shown[0].run.environment)
+        for axes in grid[1:panels]:
+            landscape_grids.draw_paths(axes, record.landscape.expert[:4], landscape_grids.EXPERT, lw=0.5)
+        bar = figure.colorbar(images[0], ax=list(grid), location="bottom", aspect=40, fraction=0.04, pad=0.02)
+        bar.set_label("reward (0: lowest, 1: highest of the panel)", fontsize=7)
+        bar.set_ticks([0, 0.5, 1])
+        kinds = {"expert": landscape_grids.EXPERT, "untrained policy": landscape_grids.POLICY}
+        handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
+        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        return figure
+
+
+def _title(axes: Axes, place: int, words: str) -> None:
+    axes.set_title(f"({'abcdefgh'[place]}) {words}", fontsize=7, loc="left", pad=2)
+
+
+def _draw_task(axes: Axes, record: LandscapesRecord) -> None:
+    landscape_grids.draw_paths(axes, record.landscape.expert, landscape_grids.EXPERT, lw=0.5)
+    landscape_grids.draw_paths(axes, record.untrained, landscape_grids.POLICY, lw=0.5)
+    landscape_grids.frame(axes, record.landscape)
+    _title(axes, 0, "task")

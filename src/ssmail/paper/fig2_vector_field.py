@@ -1,0 +1,272 @@
+"""Figure 2 (section 3.1.3; "Fig. 3" in its text): the gradient of the learned reward around the current trajectory,
+for the ranges that alpha is drawn from.
+
+An arrow stands at the position of tau_alpha = (1 - alpha) tau_G + alpha tau_E at some steps, for alpha from -1 to
+below 1. tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is for
+each of them the nearest training trajectory. The arrow has the direction of the gradient of an agent's reward with
+respect to its own position, at the state and the action of tau_alpha; its colour tells whether that is towards the
+position of tau_E at the same step (by less than a right angle) or away. Where nothing is left to go, or
+the gradient is nil, there is no arrow.
+
+A panel for each range shows one seed, the one with the median `landscape/behind_cosine` (the lower of two): the mean
+cosine between gradient and way to the expert over all points with a negative alpha, over all rollouts, steps and
+agents. The numbers of every seed are in the CSV and the notes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ssmail.config.experiments import ablation, as_written, figure_requirements
+from ssmail.data.trajectories import Floats
+from ssmail.errors import InputError
+from ssmail.evaluation.landscape import cosines
+from ssmail.plots import landscape_grids, style
+from ssmail.plots.ablation_selection import select_ablation
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import Selection
+from ssmail.store import RunRow, RunState, Store
+
+NAME = "fig2"
+BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
+STEPS = 10  # of a trajectory, at which arrows stand
+TRAJECTORIES = 1
+REACH = 0.7  # how far the frame follows a policy that leaves the expert, as a share of the expert's longer side
+MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
+TOWARDS, AWAY = "#009E73", "#CC79A7"
+ARROW = 0.03  # length, as a share of the frame's width
+
+
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The gradients around the trajectories of one run. Positions are in the environment's own units."""
+
+    label: str
+    run: RunRow
+    epoch: int
+    alpha: Floats  # (A,)
+    current: Floats  # (R, T, N, 2)
+    expert: Floats  # (R, T, N, 2)
+    gradient: Floats  # (A, R, T, N, 2) at tau_alpha, per scaled unit
+
+    @property
+    def places(self) -> Floats:
+        """(A, R, T, N, 2) positions of tau_alpha."""
+        return self.current + self.alpha[:, None, None, None, None] * (self.expert - self.current)
+
+    @property
+    def cosine(self) -> Floats:
+        """(A, R, T, N) between the gradient and the way to the expert."""
+        return cosines(self.gradient, self.expert - self.places)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """The numbers of one run; NaN when it diverged before they were measured."""
+
+    label: str
+    run: RunRow
+    behind: float
+    ahead: float
+
+
+@dataclass(frozen=True, eq=False)
+class VectorFieldRecord:
+    """Everything that figure 2 shows."""
+
+    fields: tuple[Field, ...]  # one for each range
+    measured: tuple[Measured, ...]
+    spacing: float  # of the plane's grid: what is nearer to the expert than this has no arrow
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """Left, right, bottom and top of all that is shown but for the arrows, with a margin; of a policy that is far
+        away no more than REACH times the expert's longer side.
+        """
+        current, expert = (
+            np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in self.fields])
+            for kind in ("current", "expert")
+        )
+        low, high = expert.min(axis=0), expert.max(axis=0)
+        reach = REACH * (high - low).max()
+        seen = np.clip(current[np.isfinite(current).all(axis=1)], low - reach, high + reach)
+        (left, bottom), (right, top) = (f(np.concatenate([expert, seen]), axis=0) for f in (np.min, np.max))
+        margin = MARGIN * max(right - left, top - bottom)
+        return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
+
+    def table(self) -> pd.DataFrame:
+        """[kind, label, run_id, seed, behind_cosine, ahead_cosine, epoch, alpha, trajectory, agent, step, x, y,
+        gradient_x, gradient_y, cosine].
+
+        kind: number (of a run), current, expert, or arrow (a point of tau_alpha, with the gradient per scaled unit).
+        """
+        numbers = [("number", one.label, one.run.id, one.run.seed, one.behind, one.ahead) for one in self.measured]
+        named = ["kind", "label", "run_id", "seed", "behind_cosine", "ahead_cosine"]
+        parts = [pd.DataFrame(numbers, columns=named)]
+        for field in self.fields:
+            parts += _field_rows(field)
+        points = ["epoch", "alpha", "trajectory", "agent", "step", "x", "y", "gradient_x", "gradient_y", "cosine"]
+        table = pd.concat(parts, ignore_index=True).reindex(columns=[*named, *points])
+        return table.astype(dict.fromkeys(["seed", "epoch", "trajectory", "agent", "step"], "Int64"))
+
+
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> VectorFieldRecord:
+    """The runs that `ssmail.plots.ablation_selection` chooses, or those of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without a vector field.
+    """
+    selection = select_ablation(store, NAME, runs, profile)
+    selection = selection if runs else _of_the_paper(selection)
+    measured = _measured(store, selection)
+    chosen = [median_of([one for one in measured if one.label == group.label]) for group in selection.groups]
+    fields = tuple(_field(store, one) for one in chosen)
+    first = chosen[0].run
+    return VectorFieldRecord(
+        fields=fields,
+        measured=measured,
+        spacing=landscape_grids.read(store, first, landscape_grids.stored_epochs(store, first)[0]).plane.spacing,
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=(*selection.notes, *_notes(measured, fields)),
+    )
+
+
+def _of_the_paper(selection: Selection) -> Selection:
+    """Without values that the ablation of experiments.yaml does not have, such as the range of Figure 1."""
+    entry = figure_requirements(NAME)
+    values = ablation(str(entry.ablation), entry.environment).values
+    groups = tuple(group for group in selection.groups if group.value in values)
+    others = [group.label for group in selection.groups if group.value not in values]
+    if not groups or not others:
+        return selection
+    note = f"left out, for the figure compares {' and '.join(map(str, map(as_written, values)))}: {', '.join(others)}."
+    return Selection(groups, (*selection.notes, note))
+
+
+def median_of(measured: Sequence[Measured]) -> Measured:
+    """The one with the median behind cosine, the lower of two, among those that have a number."""
+    known = [one for one in measured if np.isfinite(one.behind)]
+    if not known:
+        raise InputError(f"no run with alpha in {measured[0].label} has a vector field; leave them out.")
+    ranked = sorted(known, key=lambda one: (one.behind, one.run.seed))
+    return ranked[(len(ranked) - 1) // 2]
+
+
+def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
+    latest = store.latest_metrics([run.id for run in selection.runs], names=[BEHIND, AHEAD])
+    keys = zip(latest["run_id"].tolist(), latest["name"].tolist(), strict=True)
+    values = dict(zip(keys, latest["value"].tolist(), strict=True))
+    found = []
+    for group in selection.groups:
+        for run in group.runs:
+            if (run.id, BEHIND) not in values and run.state is not RunState.DIVERGED:
+                landscape_grids.stored_epochs(store, run)  # says why, where there is no landscape at all
+                raise InputError(f"run {run.name} ({run.state}) has no {BEHIND} yet; leave it out or train it further.")
+            numbers = (values.get((run.id, name), float("nan")) for name in (BEHIND, AHEAD))
+            found.append(Measured(group.label, run, *numbers))
+    return tuple(found)
+
+
+def _field(store: Store, measured: Measured) -> Field:
+    run = measured.run
+    metrics = store.latest_metrics([run.id], names=[BEHIND])
+    kinds = ("alpha", "current", "expert", "gradient")
+    arrays = (store.array(run.id, f"vector_field/{kind}").astype(np.float64) for kind in kinds)
+    return Field(measured.label, run, int(metrics["step"].iloc[0]), *arrays)
+
+
+def _notes(measured: Sequence[Measured], fields: Sequence[Field]) -> list[str]:
+    notes = []
+    for field in fields:
+        of = [one for one in measured if one.label == field.label]
+        numbers = ", ".join(f"{one.behind:.2f} (seed {one.run.seed})" for one in of)
+        notes.append(
+            f"alpha in {field.label}: after epoch {field.epoch} the mean cosine behind the current trajectory is "
+            f"{numbers}; seed {field.run.seed} is shown, the median."
+        )
+    return notes
+
+
+def _arrows(field: Field) -> tuple[np.ndarray, ...]:
+    """Indices (A', R', T') of the points that have arrows."""
+    alphas = np.arange(len(field.alpha))
+    steps = np.unique(np.linspace(0, field.current.shape[1] - 1, STEPS).round().astype(int))
+    return np.ix_(alphas, np.arange(min(TRAJECTORIES, len(field.current))), steps)
+
+
+def _field_rows(field: Field) -> list[pd.DataFrame]:
+    named = {"label": field.label, "run_id": field.run.id, "seed": field.run.seed, "epoch": field.epoch}
+    shown = slice(TRAJECTORIES)
+    rows = [
+        landscape_grids.path_rows(getattr(field, kind)[shown], kind=kind, **named) for kind in ("current", "expert")
+    ]
+    at = _arrows(field)
+    alphas, trajectories, steps = (index.ravel() for index in at)
+    places, gradient, cosine = field.places[at], field.gradient[at], field.cosine[at]
+    a, r, t, agent = (index.ravel() for index in np.indices(cosine.shape))
+    columns = {"alpha": field.alpha[alphas[a]], "trajectory": trajectories[r], "step": steps[t], "agent": agent}
+    columns |= {"x": places[..., 0].ravel(), "y": places[..., 1].ravel(), "cosine": cosine.ravel()}
+    columns |= {"gradient_x": gradient[..., 0].ravel(), "gradient_y": gradient[..., 1].ravel()}
+    return [*rows, pd.DataFrame({"kind": "arrow", **named, **columns})]
+
+
+def draw(record: VectorFieldRecord) -> Figure:
+    """A panel for each range, all of one frame, side by side where it is tall and else below one another; the legend
+    stands above.
+    """
+    left, right, bottom, top = frame = record.frame
+    beside = top - bottom > 0.8 * (right - left)
+    rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)
+    tall = float(np.clip(2.6 / columns * (top - bottom) / (right - left), 0.6, 3.0))
+    with style.sheet():
+        figure = style.new_figure(height=0.9 + rows * (tall + 0.2))
+        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
+        for axes, field in zip(panels, record.fields, strict=True):
+            _draw_field(axes, field, record.spacing)
+            axes.set(xlim=frame[:2], ylim=frame[2:])
+            axes.set_aspect("equal")
+            axes.grid(False)
+        landscape_grids.label_axes(list(panels), columns, record.fields[0].run.environment)
+        kinds = {"current trajectory": landscape_grids.POLICY, "expert": landscape_grids.EXPERT}
+        handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
+        marks = {"slope towards the expert": TOWARDS, "away from it": AWAY}
+        handles += [
+            Line2D([], [], color=colour, ls="", marker=r"$\rightarrow$", ms=8, mew=0, label=label)
+            for label, colour in marks.items()
+        ]
+        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        return figure
+
+
+def _draw_field(axes: Axes, field: Field, spacing: float) -> None:
+    shown = slice(TRAJECTORIES)
+    landscape_grids.draw_paths(axes, field.expert[shown], landscape_grids.EXPERT, lw=1.0)
+    landscape_grids.draw_paths(axes, field.current[shown], landscape_grids.POLICY, lw=1.0)
+    at = _arrows(field)
+    found = (field.places, field.gradient, field.cosine)
+    places, gradient, cosine = (values[at].reshape(-1, *values.shape[4:]) for values in found)
+    lengths = np.linalg.norm(gradient, axis=-1, keepdims=True)
+    far = np.linalg.norm(field.expert - field.places, axis=-1)[at].ravel() >= spacing
+    arrows = gradient / np.maximum(lengths, 1e-12)
+    for towards, colour in ((True, TOWARDS), (False, AWAY)):
+        use = far & ((cosine > 0) == towards) & (lengths[:, 0] > 0)
+        if not use.any():
+            continue
+        axes.quiver(
+            *places[use].T,
+            *arrows[use].T,
+            color=colour,
+            scale=1 / ARROW,
+            scale_units="width",
+            width=0.006,
+            headwidth=4,
+            pivot="tail",
+            zorder=3,
+        )
+    axes.set_title(rf"$\alpha$ in {field.label}, seed {field.run.seed}", fontsize=7, pad=2)

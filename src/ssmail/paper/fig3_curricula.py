@@ -1,0 +1,115 @@
+"""Figure 3 (section 4.4): how long the segments are that a policy generates between two interventions, over epochs.
+
+For each curriculum of the ablation `curriculum` the measured mean segment length (`curriculum/segment_length`) of every
+seed, its centre and spread over all runs, and over it, dashed and black, the closed form that a run stores with the
+measurement: T / (1 + (T - 1) f) steps for T steps and the intervention probability f of the epoch.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
+
+from ssmail.errors import InputError
+from ssmail.evaluation.statistics import Statistic
+from ssmail.plots import curves, style
+from ssmail.plots.ablation_selection import select_ablation
+from ssmail.plots.curves import Band, Curve, band, silent
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import Group
+from ssmail.store import Store
+
+NAME = "fig3"
+DASHES = (0, (4, 2))
+MEASURED, EXPECTED = "curriculum/segment_length", "curriculum/expected_segment_length"
+
+
+@dataclass(frozen=True, eq=False)
+class CurriculaRecord:
+    """Everything that figure 3 shows; lengths in steps."""
+
+    bands: tuple[Band, ...]  # one for each curriculum, measured
+    expected: tuple[Curve, ...]  # of each, the closed form, of the run with the most epochs
+    statistic: Statistic
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[kind, label, run_id, seed, epoch, value, low, high]; kind: run, mean or median, diverged, closed form."""
+        rows = [row for shown in self.bands for row in shown.rows(self.statistic)]
+        for shown, curve in zip(self.bands, self.expected, strict=True):
+            name = ("closed form", shown.label, curve.run_id, curve.seed)
+            points = zip(curve.epochs, curve.values, strict=True)
+            rows += [(*name, *point, np.nan, np.nan) for point in points]
+        return pd.DataFrame(rows, columns=list(curves.COLUMNS))
+
+
+def collect(
+    store: Store,
+    runs: Sequence[str] | None = None,
+    *,
+    profile: str | None = None,
+    statistic: Statistic = Statistic.MEAN_STD,
+) -> CurriculaRecord:
+    """The segment lengths of the runs that `ssmail.plots.ablation_selection` chooses, or of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run that stored no segment lengths.
+    """
+    selection = select_ablation(store, NAME, runs, profile)
+    values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
+    measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
+    for group in selection.groups:
+        for run in silent(group, measured):
+            raise InputError(f"run {run.name} ({run.state}) has no {MEASURED}; leave it out or train it again.")
+    return CurriculaRecord(
+        bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
+        expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
+        statistic=statistic,
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=selection.notes,
+    )
+
+
+def _longest(group: Group, expected: pd.DataFrame, statistic: Statistic) -> Curve:
+    """The closed form is the same for every seed, so that of the run with the most epochs tells it."""
+    return max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
+
+
+def draw(record: CurriculaRecord) -> Figure:
+    """The record on one pair of axes, lengths on a logarithmic scale with plain numbers; the legend stands above."""
+    with style.sheet():
+        figure = style.new_figure(height=2.9)
+        axes = figure.add_subplot()
+        _length_axis(axes, record)
+        style.epoch_axis(axes)
+        strokes = style.strokes([shown.label for shown in record.bands])
+        handles = []
+        for shown, marker in zip(record.bands, cycle("so^Dv"), strict=False):
+            look = {"ls": "-", "marker": marker, "markevery": 0.15, "mew": 0, "alpha": 0.75}
+            line = curves.draw_band(axes, shown, strokes[shown.label], **look)
+            line.set_label(curves.count_label(shown))
+            handles.append(line)
+        for shown, curve in zip(record.bands, record.expected, strict=True):
+            (line,) = axes.plot(curve.epochs, curve.values, color=style.REFERENCE, lw=0.8, ls=DASHES, zorder=4)
+            line.set_gid(f"closed-form-{shown.label}")
+        handles.append(Line2D([], [], color=style.REFERENCE, lw=0.8, ls=DASHES, label="expected, T / (1 + (T - 1) f)"))
+        title = curves.legend_title(record.statistic)
+        figure.legend(handles=handles, loc="outside upper center", ncols=1, title=title)
+        return figure
+
+
+def _length_axis(axes: Axes, record: CurriculaRecord) -> None:
+    """From 1 step, the shortest segment, to the longest there is."""
+    top = max((float(shown.finite.max(initial=1.0)) for shown in record.bands), default=1.0)
+    axes.set_yscale("log")
+    axes.set_ylim(0.9, max(1.15 * top, 2))
+    axes.yaxis.set_major_locator(FixedLocator([step * 10**power for power in range(4) for step in (1, 2, 5)]))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+    axes.set_ylabel("mean segment length (steps)")

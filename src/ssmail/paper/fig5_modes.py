@@ -1,0 +1,235 @@
+"""Figure 5 (section 4.3): where a trained policy goes on Y-Junction, over the expert's two lanes, seed by seed.
+
+Each panel shows sampled rollouts of the best-validation model from test starts, one for each of STARTS starts spread
+over the test split and the samples in turn, with a dot where an agent ends. Grey lines are the expert's continuations
+of the same starts into both lanes. The shares in a panel are the stored test metrics, over *all* starts and samples:
+`test/on_lane` (agents that end on a lane) and `test/lane_balance` (rollouts that take the rarer lane, at most 50 %).
+A run that diverged has no test rollouts: its panel says so. A rollout that leaves the frame is cut there and counted.
+The grey lines are drawn wide, to be seen beneath the rollouts; their width means nothing.
+
+Deviation: the paper shows one trajectory set for each method; here every seed has its panel.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ssmail.errors import InputError
+from ssmail.plots import style
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import SETTLED, Selection, select
+from ssmail.store import RunRow, RunState, Store
+
+NAME = "fig5"
+STARTS = 16
+ON_LANE, LANE_BALANCE = "test/on_lane", "test/lane_balance"
+REACH = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
+LANE_WIDTH = 3.5  # points: the expert shows as a wide lane beneath the rollouts
+
+Floats = npt.NDArray[np.floating]
+Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """What one run does."""
+
+    label: str
+    run_id: str
+    seed: int
+    rollouts: Floats | None  # (R, T, N, 2) step lengths; None when the run diverged
+    on_lane: float  # 0..1 over all rollouts; NaN when the run diverged
+    lane_balance: float  # 0..0.5 likewise
+
+
+@dataclass(frozen=True, eq=False)
+class ModesRecord:
+    """Everything that figure 5 shows. Positions are in step lengths (the approach speed times one step)."""
+
+    panels: tuple[Panel, ...]
+    expert: Floats  # (L, R, T, N, 2) the shown starts continued into each lane; empty when all runs diverged
+    frame: Frame
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[kind, label, run_id, seed, on_lane, lane_balance, lane, trajectory, agent, step, x, y].
+
+        kind: expert, rollout, or diverged (one row without a position). Steps count from 0.
+        """
+        lanes = [_points(lane, kind="expert", lane=index) for index, lane in enumerate(self.expert)]
+        table = pd.concat([*lanes, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
+        order = ["kind", "label", "run_id", "seed", "on_lane", "lane_balance", "lane"]
+        table = table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
+        return table.astype(dict.fromkeys(["seed", "lane", "trajectory", "agent", "step"], "Int64"))
+
+    def outside(self, panel: Panel) -> int:
+        """How many of a panel's rollouts leave the frame or are not finite."""
+        if panel.rollouts is None:
+            return 0
+        x_from, x_to, y_from, y_to = self.frame
+        x, y = panel.rollouts[..., 0], panel.rollouts[..., 1]
+        inside = (x >= x_from) & (x <= x_to) & (y >= y_from) & (y <= y_to)  # False for NaN
+        return int((~inside).any(axis=(1, 2)).sum())
+
+
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
+    """The test rollouts of the runs that `ssmail.plots.selection` chooses, or of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
+    """
+    selection = select(store, NAME, runs, profile)
+    for run in selection.runs:
+        if run.state not in SETTLED:
+            raise InputError(f"run {run.name} ({run.state}) has no test rollouts; leave it out or train it to its end.")
+    finished = [run for run in selection.runs if run.state is RunState.FINISHED]
+    expert = _expert(store, finished[0]) if finished else np.empty((0, 0, 0, 0, 2))
+    panels = _panels(store, selection)
+    return ModesRecord(
+        panels=panels,
+        expert=expert,
+        frame=_frame(expert, [panel.rollouts for panel in panels if panel.rollouts is not None]),
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=selection.notes,
+    )
+
+
+def _shown(starts: int) -> npt.NDArray[np.int64]:
+    """Indices of the shown starts, spread over all."""
+    return np.linspace(0, starts - 1, min(STARTS, starts)).round().astype(np.int64)
+
+
+def _expert(store: Store, run: RunRow) -> Floats:
+    return shown_lanes(store.array(run.id, "test/lanes"))
+
+
+def shown_lanes(lanes: Floats) -> Floats:
+    """Of (L, B, T, N, 2), the starts that are shown: (L, R, T, N, 2). What is shown already stays as it is."""
+    return lanes[:, _shown(lanes.shape[1])]
+
+
+def shown_rollouts(samples: Floats) -> Floats:
+    """Of (S, B, T, N, 2), the rollouts that are shown, the samples in turn: (1, R, T, N, 2); likewise."""
+    starts = _shown(samples.shape[1])
+    return samples[np.arange(len(starts)) % len(samples), starts][None]
+
+
+THINNINGS = {"test/lanes": shown_lanes, "test/rollouts": shown_rollouts}
+
+
+def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
+    """The extent of the expert, and of the rollouts where they leave it by at most REACH of its larger side."""
+    if not rollouts:
+        return (0.0, 1.0, 0.0, 1.0)
+    low, high = expert.min(axis=(0, 1, 2, 3)), expert.max(axis=(0, 1, 2, 3))
+    side = (high - low).max()
+    shown = np.concatenate([positions.reshape(-1, 2) for positions in rollouts])
+    shown = np.clip(np.where(np.isfinite(shown), shown, low), low - REACH * side, high + REACH * side)
+    low, high = np.minimum(low, shown.min(axis=0)), np.maximum(high, shown.max(axis=0))
+    margin = 0.05 * side
+    return (float(low[0] - margin), float(high[0] + margin), float(low[1] - margin), float(high[1] + margin))
+
+
+def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
+    metrics = store.latest_metrics([run.id for run in selection.runs], names=[ON_LANE, LANE_BALANCE])
+    keys = zip(metrics["run_id"].tolist(), metrics["name"].tolist(), strict=True)
+    values: dict[tuple[str, str], float] = dict(zip(keys, metrics["value"].tolist(), strict=True))
+    return tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
+
+
+def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
+    if run.state is RunState.DIVERGED:
+        return Panel(label, run.id, run.seed, None, np.nan, np.nan)
+    rollouts = shown_rollouts(store.array(run.id, "test/rollouts"))[0]
+    return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
+
+
+def _points(trajectories: Floats, **columns: object) -> pd.DataFrame:
+    """(R, T, N, 2) as rows of trajectory, agent, step, x, y after the constant `columns`."""
+    trajectory, step, agent = (index.ravel() for index in np.indices(trajectories.shape[:-1]))
+    x, y = trajectories.reshape(-1, 2).T
+    rows = {"trajectory": trajectory, "agent": agent, "step": step, "x": x, "y": y}
+    return pd.DataFrame({**columns, **rows}).sort_values(["trajectory", "agent", "step"])
+
+
+def _panel_rows(panel: Panel) -> pd.DataFrame:
+    run = {"label": panel.label, "run_id": panel.run_id, "seed": panel.seed}
+    if panel.rollouts is None:
+        return pd.DataFrame([{"kind": "diverged", **run}])
+    shares = {"on_lane": panel.on_lane, "lane_balance": panel.lane_balance}
+    return _points(panel.rollouts, kind="rollout", **run, **shares)
+
+
+def draw(record: ModesRecord) -> Figure:
+    """The record as panels at equal scale: two labels in a column each, any other number in turn over two columns.
+
+    A column of its own has the label above it; otherwise panels of several labels say theirs.
+    """
+    labels = list(dict.fromkeys(panel.label for panel in record.panels))
+    cells = _cells(record.panels, labels)
+    rows, columns = (max(place[i] for place in cells) + 1 for i in (0, 1))
+    with style.sheet():
+        figure = style.new_figure(height=0.6 + rows * _panel_height(record.frame))
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+        strokes = style.strokes(labels)
+        for (row, column), axes in np.ndenumerate(grid):
+            panel = cells.get((row, column))
+            if panel is None:
+                axes.set_axis_off()
+                continue
+            axes.tick_params(labelbottom=(row + 1, column) not in cells)
+            if len(labels) == 2 and row == 0:
+                axes.set_title(panel.label, weight="bold", pad=4)
+            title = f"{panel.label}\nseed {panel.seed}" if len(labels) > 2 else f"seed {panel.seed}"
+            _draw_panel(axes, panel, record, title, strokes[panel.label].colour)
+        figure.supxlabel("x (step lengths)", fontsize=8)
+        figure.supylabel("y (step lengths)", fontsize=8)
+        handles = [Line2D([], [], color=style.LANE, lw=LANE_WIDTH, label="expert, both lanes")]
+        handles += [Line2D([], [], color=strokes[label].colour, lw=1.2, label=f"{label}, sampled") for label in labels]
+        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 3), columnspacing=1.2)
+        return figure
+
+
+def _cells(panels: Sequence[Panel], labels: Sequence[str]) -> dict[tuple[int, int], Panel]:
+    """(row, column) of each panel."""
+    if len(labels) != 2:
+        return {(i // 2, i % 2): panel for i, panel in enumerate(panels)}
+    columns = [[panel for panel in panels if panel.label == label] for label in labels]
+    return {(i, j): panel for j, column in enumerate(columns) for i, panel in enumerate(column)}
+
+
+def _panel_height(frame: Frame) -> float:
+    """Inches that a panel of half a column's width needs for equal scales, with its gap."""
+    return float(np.clip(1.35 * (frame[3] - frame[2]) / (frame[1] - frame[0]), 0.6, 2.0)) + 0.15
+
+
+def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colour: str) -> None:
+    axes.set_aspect("equal")
+    axes.set(xlim=record.frame[:2], ylim=record.frame[2:])
+    axes.grid(False)
+    for lane in record.expert:
+        _draw_paths(axes, lane, color=style.LANE, lw=LANE_WIDTH)
+    if panel.rollouts is None:
+        words = ["diverged:", "no test rollouts"]
+    else:
+        _draw_paths(axes, panel.rollouts, color=colour, lw=0.4, alpha=0.8)
+        ends = panel.rollouts[:, -1].reshape(-1, 2)
+        axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
+        words = [f"{100 * panel.on_lane:.0f} % on lane", f"rarer lane {100 * panel.lane_balance:.0f} %"]
+        if outside := record.outside(panel):
+            words.append(f"{outside} of {len(panel.rollouts)} cut off")
+    axes.text(0.03, 0.97, title, transform=axes.transAxes, va="top", fontsize=7, weight="bold")
+    axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=6)
+
+
+def _draw_paths(axes: Axes, trajectories: Floats, **line: Any) -> None:
+    """(R, T, N, 2): one line for each agent of each trajectory."""
+    for trajectory in trajectories:
+        axes.plot(trajectory[..., 0], trajectory[..., 1], solid_capstyle="round", **line)

@@ -1,0 +1,222 @@
+"""Figure 6 (section 4.5): the test error on Y-Junction against beta, the pace of trajectory forcing.
+
+The error is `test/mode_mse` of the best-validation model: the position MSE to the nearer of the expert's lanes, squared
+scaled units, on a logarithmic scale. Below it `test/lane_balance`, the share of the rarer lane, because a policy that
+takes one lane alone can have a low error. Each seed is a point; beside them stand centre and spread over **all** runs
+of that beta (`ssmail.evaluation.statistics`). A diverged run has no test error: it counts as infinite, is a cross at
+the top edge and takes the mean with it; its lane balance is unknown, and takes the centre there with it. The values of
+beta are evenly spaced, because those of interest crowd near 0. The dotted line is constant velocity.
+
+Deviation: the paper shows mean and standard deviation alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from ssmail.errors import InputError
+from ssmail.evaluation.statistics import Statistic, Summary, summarise
+from ssmail.plots import style
+from ssmail.plots.ablation_selection import select_ablation
+from ssmail.plots.constant_velocity import constant_velocity
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import SETTLED, Group
+from ssmail.store import Store
+from ssmail.store.comparison import latest_values
+
+NAME = "fig6"
+ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
+SPREAD = 0.17  # of the distance between two values of beta: how far the points of one stand apart
+ASIDE = 0.26  # how far right of them their centre stands
+
+POINTS, CROSSES = style.METHODS["ssail"].colour, style.METHODS["gail"].colour
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """The runs of one value of beta."""
+
+    label: str
+    value: float
+    run_ids: tuple[str, ...]
+    seeds: tuple[int, ...]
+    error: Floats  # (R,) squared scaled units; +inf when the run diverged or its error is not finite, NaN if unknown
+    balance: Floats  # (R,) 0..0.5; NaN when it is unknown
+    error_summary: Summary  # each a number
+    balance_summary: Summary
+
+    @property
+    def diverged(self) -> int:
+        """How many runs have no finite error."""
+        return int(np.isposinf(self.error).sum())
+
+
+@dataclass(frozen=True, eq=False)
+class BetaRecord:
+    """Everything that figure 6 shows."""
+
+    columns: tuple[Column, ...]  # beta rising
+    statistic: Statistic
+    constant_velocity: float | None  # squared scaled units; None when no run finished
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[kind, beta, run_id, seed, mode_mse, mode_mse_low, mode_mse_high, lane_balance, ..._low, ..._high].
+
+        kind: run, mean or median (with the ends of both spreads), or constant velocity. A diverged run has mode_mse
+        inf.
+        """
+        rows: list[tuple[object, ...]] = []
+        nothing = (np.nan, np.nan)
+        for column in self.columns:
+            runs = zip(column.run_ids, column.seeds, column.error, column.balance, strict=True)
+            rows += [("run", column.value, run, seed, error, *nothing, b, *nothing) for run, seed, error, b in runs]
+            centre = (self.statistic.centre, column.value, "", "")
+            rows.append((*centre, *map(float, column.error_summary), *map(float, column.balance_summary)))
+        if self.constant_velocity is not None:
+            rows.append(("constant velocity", "", "", "", self.constant_velocity, *nothing, np.nan, *nothing))
+        measured = [f"{name}{end}" for name in ("mode_mse", "lane_balance") for end in ("", "_low", "_high")]
+        return pd.DataFrame(rows, columns=["kind", "beta", "run_id", "seed", *measured])
+
+
+def collect(
+    store: Store,
+    runs: Sequence[str] | None = None,
+    *,
+    profile: str | None = None,
+    statistic: Statistic = Statistic.MEAN_STD,
+) -> BetaRecord:
+    """The test results of the runs that `ssmail.plots.ablation_selection` chooses, or of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
+    """
+    selection = select_ablation(store, NAME, runs, profile)
+    values = latest_values(store, selection.runs, [ERROR, BALANCE])
+    columns = tuple(_column(group, values, statistic) for group in selection.groups)
+    return BetaRecord(
+        columns=columns,
+        statistic=statistic,
+        constant_velocity=constant_velocity(store, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=(*selection.notes, *_notes(columns)),
+    )
+
+
+def _column(group: Group, values: Mapping[tuple[str, str], float], statistic: Statistic) -> Column:
+    for run in group.runs:
+        if run.state not in SETTLED:
+            raise InputError(f"run {run.name} ({run.state}) has no test error; leave it out or train it to its end.")
+    error, balance = (
+        np.array([values.get((run.id, name), np.nan) for run in group.runs], dtype=np.float64)
+        for name in (ERROR, BALANCE)
+    )
+    error = np.where(np.isfinite(error), error, np.inf)
+    return Column(
+        label=group.label,
+        value=group.value,
+        run_ids=tuple(run.id for run in group.runs),
+        seeds=tuple(run.seed for run in group.runs),
+        error=error,
+        balance=balance,
+        error_summary=summarise(error, statistic),
+        balance_summary=summarise(balance, statistic),
+    )
+
+
+def _notes(columns: Sequence[Column]) -> list[str]:
+    lost = [f"{column.label} ({column.diverged} of {len(column.error)})" for column in columns if column.diverged]
+    return (
+        [f"runs without a finite test error, of beta {', '.join(lost)}, count as infinite; a mean has no number there."]
+        if lost
+        else []
+    )
+
+
+def draw(record: BetaRecord) -> Figure:
+    """The error above, the lane balance below it, over evenly spaced values of beta. The legend stands above."""
+    with style.sheet():
+        figure = style.new_figure(height=3.3)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
+        style.log_axis(upper, _limits(record))
+        upper.set_ylabel("test error, mode_mse\n(squared scaled units)")
+        lower.set_ylim(-0.02, 0.52)
+        lower.set_ylabel("lane_balance\n(share)")
+        lower.set_xticks(range(len(record.columns)), [_short(column.label) for column in record.columns])
+        lower.set_xlabel("β (fraction of the epochs, evenly spaced values)")
+        for axes in (upper, lower):
+            axes.grid(False, axis="x")
+        handles = _draw_errors(upper, record)
+        _draw_balances(lower, record)
+        if record.constant_velocity is not None:
+            handles.append(style.draw_reference(upper, record.constant_velocity))
+        figure.legend(handles=handles, loc="outside upper center", ncols=2)
+        return figure
+
+
+def _short(label: str) -> str:
+    """0.05 -> .05, to fit beside its neighbours."""
+    return label.removeprefix("0") if label.startswith("0.") else label
+
+
+def _limits(record: BetaRecord) -> tuple[float, float]:
+    shown = [column.error for column in record.columns]
+    values = np.concatenate([*shown, [record.constant_velocity or np.nan]])
+    return style.log_limits(values)
+
+
+def _places(index: int, count: int) -> Floats:
+    """Where the points of one value of beta stand, by seed, left of its centre."""
+    return index + np.linspace(-SPREAD, SPREAD, count) * (count > 1) - ASIDE / 2
+
+
+def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
+    for index, column in enumerate(record.columns):
+        x = _places(index, len(column.error))
+        finite = np.isfinite(column.error)
+        (points,) = axes.plot(x[finite], column.error[finite], ".", color=POINTS, ms=5, mew=0, alpha=0.8)
+        points.set_gid(f"runs-{column.label}")
+        if column.diverged:
+            top = np.full(column.diverged, axes.get_ylim()[1])
+            style.draw_cross(axes, x[~finite], top, CROSSES).set_gid(f"diverged-{column.label}")
+    lowest = np.array([column.error.min() for column in record.columns])
+    summary = _over_columns([column.error_summary for column in record.columns])
+    line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
+    line.set_label(record.statistic.words)
+    handles = [Line2D([], [], color=POINTS, marker=".", ls="", ms=5, mew=0, label="one run"), line]
+    if diverged := sum(column.diverged for column in record.columns):
+        count = sum(len(column.error) for column in record.columns)
+        label = f"diverged, {diverged} of {count} runs"
+        handles.append(Line2D([], [], color=CROSSES, marker="x", ls="", ms=5, mew=1, label=label))
+    return handles
+
+
+def _draw_balances(axes: Axes, record: BetaRecord) -> None:
+    for index, column in enumerate(record.columns):
+        x = _places(index, len(column.balance))
+        axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
+    _draw_centres(axes, _over_columns([column.balance_summary for column in record.columns]))
+
+
+def _over_columns(summaries: Sequence[Summary]) -> Summary:
+    """Numbers for each of C columns -> three times (C,)."""
+    return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
+
+
+def _draw_centres(axes: Axes, summary: Summary) -> Line2D:
+    """A bar from low to high for each column, where they are finite, and the centres joined by a line."""
+    x = np.arange(len(summary.centre)) + ASIDE
+    centre = np.where(np.isfinite(summary.centre), summary.centre, np.nan)
+    high = np.where(np.isposinf(summary.high), axes.get_ylim()[1], summary.high)
+    known = np.isfinite(summary.low) & np.isfinite(high)
+    axes.vlines(x[known], summary.low[known], high[known], color=style.REFERENCE, lw=1)
+    (line,) = axes.plot(x, centre, color=style.REFERENCE, lw=0.5, marker="o", ms=2.5, gid="centres")
+    return line

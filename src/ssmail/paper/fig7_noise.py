@@ -1,0 +1,273 @@
+"""Figure 7 (section 4.6): the error of predicted motion against the predicted step, with clean and with noisy input.
+
+The error is the array `test/mse` (clean) or `test_noisy/mse` of the best-validation model, its policy sampled: for each
+predicted step the squared error over test windows, samples, joints and all six features (position and velocity), in
+squared scaled units. The noise is Gaussian, on what the model reads at test time alone, and all runs are given the same
+draws. Each seed is a thin line; the thick line and the band are centre and spread over **all** runs of a method
+(`ssmail.evaluation.statistics`). A run that diverged has no predictions: it counts as infinite at every step, is a
+cross at the top edge, is counted in the legend, and takes the mean with it. The dotted lines are constant velocity,
+given the same input.
+
+The question is whether errors grow in proportion to the step, faster or slower, so the scales are linear: on a
+logarithmic one even a straight line looks as if its slope fell. Each panel has its own, from 0; it ends at REACH times
+the largest typical error (medians of the runs, and constant velocity), and runs that rise above it are told in a note.
+
+The slope of a curve is that of the least-squares line through the last half of its steps (25 to 48 of 48), in squared
+scaled units per step: of each run, and of a method the mean over its runs with Student's t-interval. A run without a
+finite error at all of these steps has none, and then its method has none.
+
+Deviation: the paper shows mean and standard deviation with noise alone, and tells of the slope in words.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
+
+from ssmail.errors import InputError
+from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
+from ssmail.plots import curve_notes, curves, style
+from ssmail.plots.constant_velocity import REFERENCE
+from ssmail.plots.curves import Band, Curve, band
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import SETTLED, Selection, select
+from ssmail.store import RunRow, RunState, Store
+
+NAME = "fig7"
+CONDITIONS = {"clean": "", "noisy": "_noisy"}  # what is told of the input -> the end of the arrays' prefixes
+METRIC = "test/mse"
+REACH = 4.0
+REFERENCE_REACH = 8.0
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """Of the runs of one method, squared scaled units per step."""
+
+    runs: Floats  # (R,); NaN of a run that has none
+    mean: Summary  # each a number: the mean of the runs, and its interval
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """What is predicted from one kind of input. Errors in squared scaled units."""
+
+    condition: str  # a key of CONDITIONS
+    bands: tuple[Band, ...]  # one for each method, over predicted steps
+    slopes: tuple[Slopes, ...]  # likewise
+    reference: Floats  # (T,) constant velocity; empty when no run finished
+    reference_slope: float  # NaN then
+
+    @property
+    def steps(self) -> int:
+        """How many are predicted; 0 when no run finished."""
+        return max(len(self.reference), *(len(shown.epochs) for shown in self.bands))
+
+    @property
+    def end(self) -> float:
+        """Where the scale ends: a little above the highest run and the reference, but within REACH times the largest
+        typical error; a reference that leaves the methods on the ground does not count.
+        """
+        typical, highest = [float(np.median(peaks)) for peaks in self._peaks], [max(peaks) for peaks in self._peaks]
+        if not self.reference_leaves:
+            typical, highest = [*typical, *self.reference], [*highest, *self.reference]
+        return float(min(1.05 * max(highest, default=0), REACH * max(typical, default=0))) or 1.0
+
+    @property
+    def reference_leaves(self) -> bool:
+        """Whether constant velocity is so much worse than the methods that it is shown as far as the scale goes."""
+        typical = max((float(np.median(peaks)) for peaks in self._peaks), default=0.0)
+        return typical > 0 and max(self.reference, default=0) > REFERENCE_REACH * typical
+
+    @property
+    def _peaks(self) -> list[list[float]]:
+        """The highest error of each run of each method that has one."""
+        found = [[float(v.max()) for curve in shown.curves if len(v := _finite(curve))] for shown in self.bands]
+        return [peaks for peaks in found if peaks]
+
+    def rows(self, statistic: Statistic) -> Iterator[tuple[object, ...]]:
+        """Rows of NoiseRecord.table."""
+        nothing = (np.nan, np.nan)
+        for shown, slopes in zip(self.bands, self.slopes, strict=True):
+            yield from ((self.condition, *row) for row in shown.rows(statistic))
+            first = _first_of_slope(len(shown.epochs))
+            for curve, slope in zip(shown.curves, slopes.runs, strict=True):
+                yield self.condition, "run slope", shown.label, curve.run_id, curve.seed, first, slope, *nothing
+            yield self.condition, "mean slope", shown.label, "", "", first, *map(float, slopes.mean)
+        for step, error in enumerate(self.reference, start=1):
+            yield self.condition, "constant velocity", "", "", "", step, error, *nothing
+        if len(self.reference):
+            first = _first_of_slope(len(self.reference))
+            yield self.condition, "constant velocity slope", "", "", "", first, self.reference_slope, *nothing
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseRecord:
+    """Everything that figure 7 shows."""
+
+    panels: tuple[Panel, ...]
+    noise: float  # std, scaled units
+    statistic: Statistic
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[condition, kind, label, run_id, seed, step, value, low, high].
+
+        kind: run, mean or median (with the ends of the band), diverged, constant velocity; and the slopes: run slope,
+        mean slope (with its interval), constant velocity slope, at the first step of the steps that they are of.
+        """
+        columns = ["step" if name == "epoch" else name for name in curves.COLUMNS]
+        rows = [row for panel in self.panels for row in panel.rows(self.statistic)]
+        return pd.DataFrame(rows, columns=["condition", *columns])
+
+
+def collect(
+    store: Store,
+    runs: Sequence[str] | None = None,
+    *,
+    profile: str | None = None,
+    statistic: Statistic = Statistic.MEAN_STD,
+) -> NoiseRecord:
+    """The test errors of the runs that `ssmail.plots.selection` chooses, or of the given ids.
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id, a run without test errors and runs that
+    were tested in different ways.
+    """
+    selection = select(store, NAME, runs, profile)
+    forecast = _forecast(selection.runs)
+    panels = tuple(_panel(store, selection, condition, statistic) for condition in CONDITIONS)
+    what = "every state that is read" if forecast["noise_on"] == "all" else "the observed history alone"
+    noise = f"noise: std {forecast['noise']:g} (scaled units) on {what}, the same draws for all runs."
+    return NoiseRecord(
+        panels=panels,
+        noise=forecast["noise"],
+        statistic=statistic,
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=(*selection.notes, noise, *(text for panel in panels for text in _panel_notes(panel))),
+    )
+
+
+def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
+    """How all of the runs are tested, as the section `forecast` of their specs says."""
+    first = runs[0]
+    for run in runs:
+        if run.state not in SETTLED:
+            raise InputError(f"run {run.name} ({run.state}) has no test errors; leave it out or train it to its end.")
+        differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"][key]]
+        if differs:
+            raise InputError(
+                f"runs {first.name} and {run.name} differ in forecast.{differs[0]}, so {NAME} cannot compare their "
+                "errors; leave one of them out."
+            )
+    found: dict[str, Any] = first.spec["forecast"]
+    return found
+
+
+def _panel(store: Store, selection: Selection, condition: str, statistic: Statistic) -> Panel:
+    end = CONDITIONS[condition]
+    finished = [run for run in selection.runs if run.state is RunState.FINISHED]
+    errors = _over_steps({run.id: store.array(run.id, f"test{end}/mse") for run in finished})
+    bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
+    references = [store.array(run.id, f"{REFERENCE}{end}/mse") for run in finished]  # those on one data set agree
+    reference = np.median(references, axis=0) if references else np.empty(0)
+    return Panel(condition, bands, tuple(map(_slopes, bands)), reference, _slope(reference))
+
+
+def _over_steps(errors: dict[str, Floats]) -> pd.DataFrame:
+    """Errors (T,) by run id, as Store.metrics would give them, the step being that of the prediction, from 1."""
+    rows = [(run, step, value) for run, values in errors.items() for step, value in enumerate(values, start=1)]
+    return pd.DataFrame(rows, columns=["run_id", "step", "value"])
+
+
+def _finite(curve: Curve) -> Floats:
+    finite: Floats = curve.values[np.isfinite(curve.values)]
+    return finite
+
+
+def _slopes(shown: Band) -> Slopes:
+    runs = np.array([_slope(curve.values) for curve in shown.curves])
+    return Slopes(runs, mean_interval(runs))
+
+
+def _slope(errors: Floats) -> float:
+    """Of the least-squares line through the last half of (T,) errors, per step."""
+    last = errors[_first_of_slope(len(errors)) - 1 :]
+    if len(last) < 2 or not np.isfinite(last).all():
+        return np.nan
+    return float(np.polyfit(np.arange(len(last)), last, deg=1)[0])
+
+
+def _first_of_slope(steps: int) -> int:
+    """The first step, counted from 1, of the last half of `steps`."""
+    return steps // 2 + 1
+
+
+def _panel_notes(panel: Panel) -> list[str]:
+    notes = [f"{panel.condition}: {note}" for note in curve_notes.high(panel.bands, panel.end)]
+    if panel.reference_leaves:
+        where = f"rises to {max(panel.reference):.3g}, beyond {panel.end:.3g}, where the scale ends"
+        notes.append(f"{panel.condition}: constant velocity {where}.")
+    if panel.steps < 2:
+        return notes
+    told = [f"{shown.label} {_told(slopes)}" for shown, slopes in zip(panel.bands, panel.slopes, strict=True)]
+    if len(panel.reference):
+        told.append(f"constant velocity {panel.reference_slope:.2g}")
+    words = f"slope over steps {_first_of_slope(panel.steps)}-{panel.steps}, squared scaled units per step"
+    return [*notes, f"{panel.condition}: {words} (mean of the runs, {CONFIDENCE:.0%} interval): {', '.join(told)}."]
+
+
+def _told(slopes: Slopes) -> str:
+    mean, low, high = slopes.mean
+    if not np.isfinite(mean):
+        return f"none ({np.isnan(slopes.runs).sum()} of {len(slopes.runs)} runs without finite errors)"
+    return f"{mean:.2g} " + (f"({low:.2g} to {high:.2g})" if np.isfinite(low) else "(one run)")
+
+
+def draw(record: NoiseRecord) -> Figure:
+    """Clean input above, noisy input below, each to a linear scale of its own. The legend stands above them."""
+    with style.sheet():
+        figure = style.new_figure(height=3.4)
+        grid = figure.subplots(len(record.panels), 1, sharex=True)
+        strokes = style.strokes([shown.label for shown in record.panels[0].bands])
+        for axes, panel in zip(grid, record.panels, strict=True):
+            axes.set_ylim(0, panel.end)
+            handles = _draw_panel(axes, panel, strokes)
+            title = "clean input" if panel.condition == "clean" else f"noisy input (std {record.noise:g} scaled units)"
+            axes.set_title(title, loc="left", fontsize=7, weight="bold", pad=7)
+        _step_axis(grid[-1], record)
+        figure.supylabel("test error, mse (10$^{-3}$ squared scaled units)", fontsize=8)
+        title = curves.legend_title(record.statistic)
+        figure.legend(handles=handles, loc="outside upper center", ncols=2, title=title)
+        return figure
+
+
+def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> list[Line2D]:
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda error, _: f"{1000 * error:g}"))
+    handles = []
+    for shown in panel.bands:
+        handles.append(curves.draw_band(axes, shown, strokes[shown.label]))
+        handles[-1].set_label(curves.count_label(shown))
+    if len(panel.reference):
+        steps = np.arange(1, len(panel.reference) + 1)
+        (line,) = axes.plot(steps, panel.reference, color=style.REFERENCE, lw=0.8, ls=":", gid="constant-velocity")
+        line.set_label("constant velocity")
+        handles.append(line)
+    return handles
+
+
+def _step_axis(axes: Axes, record: NoiseRecord) -> None:
+    """Its ticks are the first step, the last one, and the quarters between them."""
+    steps = max(panel.steps for panel in record.panels)
+    axes.set_xlabel("predicted step")
+    axes.xaxis.set_major_locator(FixedLocator(sorted({1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))})))

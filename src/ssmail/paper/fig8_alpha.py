@@ -1,0 +1,144 @@
+"""Figure 8 (section 4.7): training over epochs, for the ranges that alpha is drawn from.
+
+The paper shows a "training loss" and does not say which. Eq. 3 cannot be it as a whole: its last term asks D for labels
+that are drawn from another range, which vary by 1/12 for [0, 1] and by 1/3 for [-1, 1], so a D that has learned nothing
+of them loses by that much more. Both panels show what is the same quantity whatever alpha is drawn from:
+
+- above, the error of the policy on training trajectories, free-running and sampled: `train/mse`, over all predicted
+  steps and features, on mocap and letters (on Y-Junction `train/mode_mse`, to the nearer lane), squared scaled units;
+- below, the discriminator's loss on tau_G and tau_E, the first two terms of Eq. 3 without the self-supervised one:
+  `discriminator/generated` + `discriminator/expert`. It is 1/2 for a D that says 1/2 of everything and 0 for one that
+  tells the two apart for certain. D is trained on all three terms, so what it makes of these two depends on the range.
+
+Each seed is a thin line; the thick line and the band are centre and spread over **all** runs of a range
+(`ssmail.evaluation.statistics`). Runs that diverge are drawn and counted as in figure 4. The dotted line is constant
+velocity.
+
+Deviation: the paper's figure is of Noisy Mocap alone; this one can be drawn of another environment too.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from ssmail.errors import InputError
+from ssmail.evaluation.statistics import Statistic
+from ssmail.plots import curve_notes, curves, style
+from ssmail.plots.ablation_selection import select_ablation
+from ssmail.plots.constant_velocity import constant_velocity
+from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.metric_units import last_part
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import Selection
+from ssmail.store import Store
+
+NAME = "fig8"
+ERRORS = {
+    "mocap": "mse",
+    "letters": "mse",
+    "yjunction": "mode_mse",
+}  # by environment: the error that tells how well a policy does
+TERMS = ("discriminator/generated", "discriminator/expert")
+LOSS = " + ".join(TERMS)
+UNDECIDED = 0.5  # the loss of a D that says 1/2 of everything
+
+
+@dataclass(frozen=True, eq=False)
+class AlphaRecord:
+    """Everything that figure 8 shows."""
+
+    error: str  # the metric of the upper panel
+    errors: tuple[Band, ...]  # one for each range; squared scaled units
+    losses: tuple[Band, ...]  # likewise; of LOSS
+    statistic: Statistic
+    constant_velocity: float | None  # squared scaled units; None when no run finished
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[metric, kind, label, run_id, seed, epoch, value, low, high].
+
+        kind: run, mean or median (with the ends of the band), diverged, or constant velocity.
+        """
+        panels = {self.error: self.errors, LOSS: self.losses}
+        rows = [(name, *row) for name, bands in panels.items() for shown in bands for row in shown.rows(self.statistic)]
+        if self.constant_velocity is not None:
+            rows.append((self.error, "constant velocity", "", "", "", "", self.constant_velocity, np.nan, np.nan))
+        return pd.DataFrame(rows, columns=["metric", *curves.COLUMNS])
+
+
+def collect(
+    store: Store,
+    runs: Sequence[str] | None = None,
+    *,
+    profile: str | None = None,
+    statistic: Statistic = Statistic.MEAN_STD,
+    environment: str | None = None,
+) -> AlphaRecord:
+    """The runs that `ssmail.plots.ablation_selection` chooses, or those of the given ids, on `environment` (or that
+    of the ablation).
+
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
+    """
+    selection = select_ablation(store, NAME, runs, profile, environment)
+    kind = ERRORS[selection.runs[0].environment]
+    error = f"train/{kind}"
+    errors = _bands(store, selection, error, [error], statistic)
+    losses = _bands(store, selection, LOSS, TERMS, statistic)
+    which = f"{error} above, {LOSS} below: not the self-supervised term of Eq. 3, whose labels depend on the range."
+    return AlphaRecord(
+        error=error,
+        errors=errors,
+        losses=losses,
+        statistic=statistic,
+        constant_velocity=constant_velocity(store, selection.runs, kind),
+        provenance=Provenance.of(NAME, selection.runs),
+        notes=(
+            *selection.notes,
+            which,
+            *curve_notes.high(errors),
+            *curve_notes.cut(errors),
+            *curve_notes.comparisons(errors),
+        ),
+    )
+
+
+def _bands(
+    store: Store, selection: Selection, name: str, metrics: Sequence[str], statistic: Statistic
+) -> tuple[Band, ...]:
+    """Of the sum of the metrics, epoch by epoch; unknown where one of them is."""
+    values = store.metrics([run.id for run in selection.runs], names=metrics)
+    for metric in metrics:
+        for group in selection.groups:
+            for run in silent(group, values[values["name"] == metric]):
+                raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
+    wide = values.pivot(index=["run_id", "step"], columns="name", values="value")
+    summed = wide.sum(axis="columns", skipna=False).rename("value").reset_index()
+    return tuple(band(group, name, summed, statistic) for group in selection.groups)
+
+
+def draw(record: AlphaRecord) -> Figure:
+    """The policy's error above, logarithmic, and the discriminator's loss below, linear. The legend stands above."""
+    with style.sheet():
+        figure = style.new_figure(height=3.4)
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
+        reference = [] if record.constant_velocity is None else [record.constant_velocity]
+        style.log_axis(upper, curves.limits(record.errors, reference))
+        upper.set_ylabel(f"training error, {last_part(record.error)}\n(squared scaled units)")
+        low, high = curves.linear_limits(record.losses)
+        lower.set_ylim(min(low, 0), max(high, 1.1 * UNDECIDED))
+        lower.set_ylabel("loss of D\n" r"on $\tau_G$ and $\tau_E$")
+        strokes = style.strokes([shown.label for shown in record.errors])
+        handles = []
+        for above, below in zip(record.errors, record.losses, strict=True):
+            handles.append(curves.draw_band(upper, above, strokes[above.label]))
+            handles[-1].set_label(rf"$\alpha$ in {curves.count_label(above)}")
+            curves.draw_band(lower, below, strokes[below.label])
+        handles += [style.draw_reference(upper, error) for error in reference]
+        style.epoch_axis(lower)
+        title = curves.legend_title(record.statistic)
+        figure.legend(handles=handles, loc="outside upper center", ncols=1, title=title)
+        return figure

@@ -1,0 +1,190 @@
+"""Figure 9 (sections 4.1, B.2): a snapshot of the Y-Junction environment.
+
+The road, its fork and its two lanes; on it, one training trajectory of the expert for each lane (the first of that
+lane) with its agents at a few time steps: filled on the first trajectory, open on the second. The road is drawn twice
+as wide as the expert set strays from the centre lines. Any stored Y-Junction run will do, whatever its method; by
+default it is the newest that holds the expert set.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ssmail.config.experiments import figure_requirements
+from ssmail.errors import InputError
+from ssmail.plots import NoRuns, style
+from ssmail.plots.provenance import Provenance
+from ssmail.plots.selection import command
+from ssmail.store import RunRow, Store
+
+NAME = "fig9"
+ARRAYS = ("train/expert", "train/lane", "lane_centres")
+SNAPSHOTS = 4  # time steps at which the agents are shown, the first and the last among them
+MARKERS = ("o", "s", "^", "D", "v", "P")
+
+Floats = npt.NDArray[np.floating]
+Integers = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class YJunctionRecord:
+    """Everything that figure 9 shows. Positions are in step lengths (the approach speed times one step)."""
+
+    trajectories: Floats  # (R, T, N, 2) one for each lane that the training set uses
+    lanes: Integers  # (R,) the lane of each
+    steps: Integers  # (K,) the time steps at which agents are shown
+    centre_lines: Floats  # (L, P, 2) street and lane
+    half_width: float  # of the road, as drawn
+    fork: tuple[float, float]  # the last point that all centre lines share
+    provenance: Provenance
+    notes: tuple[str, ...]
+
+    def table(self) -> pd.DataFrame:
+        """[kind, lane, agent, step, x, y]; kind: centre line (step counts its points), trajectory, agent, or fork."""
+        rows: list[tuple[object, ...]] = [("fork", "", "", "", *self.fork)]
+        for lane, line in enumerate(self.centre_lines):
+            rows += [("centre line", lane, "", point, *xy) for point, xy in enumerate(line)]
+        for lane, trajectory in zip(self.lanes, self.trajectories, strict=True):
+            for kind, steps in (("trajectory", range(len(trajectory))), ("agent", self.steps)):
+                rows += [(kind, lane, n, t, *xy) for t in steps for n, xy in enumerate(trajectory[t])]
+        return pd.DataFrame(rows, columns=["kind", "lane", "agent", "step", "x", "y"])
+
+
+def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> YJunctionRecord:
+    """The environment as the newest run that holds it stored it; among the given ids, if there are any, else among the
+    runs on the same data (a compact database holds the expert set once).
+
+    Raises NoRuns when no run of the environment holds its expert set, InputError for an unfit id.
+    """
+    run, notes = _source(store, runs, profile)
+    expert, lane, centre_lines = (store.array(run.id, name) for name in ARRAYS)
+    used, first = np.unique(lane, return_index=True)
+    return YJunctionRecord(
+        trajectories=expert[first],
+        lanes=used,
+        steps=np.linspace(0, expert.shape[1] - 1, SNAPSHOTS).round().astype(np.int64),
+        centre_lines=centre_lines,
+        half_width=2 * max(_strays(expert[lane == index], centre_lines[index]) for index in used),
+        fork=_fork(centre_lines),
+        provenance=Provenance.of(NAME, [run]),
+        notes=notes,
+    )
+
+
+def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tuple[RunRow, tuple[str, ...]]:
+    needed = figure_requirements(NAME)
+    environment = needed.environment
+    stored = store.runs(ids=ids) if ids else store.runs(environment=environment, profile=profile)
+    fitting = _holding(store, stored, environment)
+    if not fitting and ids:
+        data = {run.dataset_hash for run in stored if run.environment == environment and run.dataset_hash}
+        others = [run for run in store.runs(environment=environment) if run.dataset_hash in data]
+        fitting = _holding(store, others, environment)
+    if fitting:
+        return fitting[-1], (f"the environment is that of run {fitting[-1].name}.",)
+    remedy = f"run {command(needed.methods[0], environment, profile)}"
+    if ids:
+        raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
+    found = "no finished run" if stored else "no run"
+    raise NoRuns(f"{NAME} has nothing to draw: {store.where} holds {found} on {environment}; {remedy}.")
+
+
+def _holding(store: Store, runs: Sequence[RunRow], environment: str) -> list[RunRow]:
+    """Those of the runs that hold the environment's expert set."""
+    return [run for run in runs if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))]
+
+
+def _strays(trajectories: Floats, line: Floats) -> float:
+    """The largest distance of any position of (B, T, N, 2) from the points of a centre line (P, 2)."""
+    positions = trajectories.reshape(-1, 1, 2)
+    return float(np.linalg.norm(positions - line, axis=-1).min(axis=-1).max())
+
+
+def _fork(centre_lines: Floats) -> tuple[float, float]:
+    """The last point that the centre lines (L, P, 2) share; the first point if they never do."""
+    together = np.isclose(centre_lines, centre_lines[0]).all(axis=(0, 2))  # (P,)
+    x, y = centre_lines[0, max(int(together.argmin()) - 1, 0)]
+    return float(x), float(y)
+
+
+def draw(record: YJunctionRecord) -> Figure:
+    """The record seen from above, both axes at one scale; the legend of the agents stands above."""
+    with style.sheet():
+        figure = style.new_figure(height=_height(record))
+        axes = figure.add_subplot()
+        axes.set_aspect("equal")
+        axes.grid(False)
+        axes.set_xlabel("x (step lengths)")
+        axes.set_ylabel("y (step lengths)")
+        _draw_road(axes, record)
+        for index, trajectory in enumerate(record.trajectories):
+            _draw_agents(axes, trajectory, record.steps, first=index == 0)
+        _draw_times(axes, record)
+        figure.legend(loc="outside upper center", ncols=record.trajectories.shape[2], handletextpad=0.2)
+        return figure
+
+
+def _height(record: YJunctionRecord) -> float:
+    """Inches that equal scales need at one column's width, with labels and legend."""
+    extent = np.ptp(record.centre_lines, axis=(0, 1))
+    return float(np.clip(2.5 * extent[1] / extent[0], 0.8, 3.5)) + 0.85
+
+
+def _draw_road(axes: Axes, record: YJunctionRecord) -> None:
+    for lane, line in enumerate(record.centre_lines):
+        edge = _outline(line, record.half_width)
+        axes.fill(edge[:, 0], edge[:, 1], color=style.LANE, lw=0, zorder=0)
+        axes.plot(line[:, 0], line[:, 1], color="white", lw=0.8, ls=(0, (6, 4)), zorder=1, gid=f"centre-line-{lane}")
+        axes.annotate(f"lane {lane}", line[-1], xytext=(4, 0), textcoords="offset points", va="center", fontsize=7)
+    axes.plot(*record.fork, "+", color=style.REFERENCE, ms=6, mew=0.8, zorder=4)
+    for name, (x, y) in (("fork", record.fork), ("street", (record.centre_lines[0, 0] + record.fork) / 2)):
+        below = (x, y - record.half_width)
+        axes.annotate(name, below, xytext=(0, -4), textcoords="offset points", ha="center", va="top", fontsize=7)
+
+
+def _outline(line: Floats, half_width: float) -> Floats:
+    """(2 P, 2) the edge of a strip along a line (P, 2)."""
+    along = np.gradient(line, axis=0)
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    sideways = half_width * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return np.concatenate([line + sideways, (line - sideways)[::-1]])
+
+
+def _draw_agents(axes: Axes, trajectory: Floats, steps: Integers, first: bool) -> None:
+    """(T, N, 2): each agent's track, and the agent itself at `steps`."""
+    for agent in range(trajectory.shape[1]):
+        colour = style.AGENTS[agent % len(style.AGENTS)]
+        x, y = trajectory[:, agent].T
+        axes.plot(x, y, color=colour, lw=0.6, alpha=0.7, zorder=2)
+        axes.plot(
+            x[steps],
+            y[steps],
+            MARKERS[agent % len(MARKERS)],
+            ms=4,
+            mew=0.8,
+            mec=colour,
+            mfc=colour if first else "white",
+            zorder=3,
+            label=f"agent {agent}" if first else None,
+        )
+
+
+def _draw_times(axes: Axes, record: YJunctionRecord) -> None:
+    """The time step beside the middle agent of each shown group, above the upper lane."""
+    upper = record.trajectories[record.trajectories[:, -1, 0, 1].argmax()]
+    middle = upper[:, upper.shape[1] // 2]
+    for step in record.steps:
+        x, y = middle[step]
+        axes.annotate(
+            f"t = {step}",
+            (x, y + record.half_width),
+            xytext=(-4, 8),
+            textcoords="offset points",
+            ha="right" if y > record.half_width else "center",
+            fontsize=7,
+        )

@@ -1,0 +1,101 @@
+"""The figures of the paper, redrawn from the store alone; `training_curves` and `landscape_film`, for questions that it
+does not ask; and `skeleton`, a picture of the motion-capture data.
+
+Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
+Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.
+"""
+
+import importlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from ssmail.plots import FigureRecord
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.store import Store
+    from ssmail.store.maintenance.compact import Thinning
+
+
+@dataclass(frozen=True)
+class FigureModule:
+    """One figure: its name in the paper, its alias, and its module, imported at first use."""
+
+    name: str
+    alias: str
+    summary: str
+    has_statistic: bool = False  # whether it shows a centre and spread, of one's choice
+    has_environment: bool = False  # whether it can be drawn of another environment than its own
+
+    @property
+    def stem(self) -> str:
+        """The name of the module and, without the ending, of the files that are saved."""
+        return f"{self.name}_{self.alias}".replace("-", "_")
+
+    def collect(
+        self,
+        store: "Store",
+        runs: Sequence[str] | None = None,
+        *,
+        profile: str | None = None,
+        statistic: "Statistic | None" = None,
+        environment: str | None = None,
+    ) -> FigureRecord:
+        """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs, of `profile`.
+
+        `statistic`, mean-std by default, and `environment`, the paper's by default, are for figures that have one, and
+        of no effect on others. Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
+        """
+        options: dict[str, Any] = {}
+        if self.has_statistic and statistic is not None:
+            options["statistic"] = statistic
+        if self.has_environment and environment is not None:
+            options["environment"] = environment
+        return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
+
+    def draw(self, record: FigureRecord) -> "Figure":
+        """The record as a matplotlib Figure, one column wide."""
+        return cast("Figure", self._module().draw(record))
+
+    def thinnings(self) -> "Mapping[str, Thinning]":
+        """By the names of stored arrays, what makes of each the part that the figure shows, where it does not show all.
+
+        The figure shows the same of the part as of the whole.
+        """
+        return cast("Mapping[str, Thinning]", getattr(self._module(), "THINNINGS", {}))
+
+    def _module(self) -> Any:
+        return importlib.import_module(f"ssmail.paper.{self.stem}")
+
+
+_MODULES = (
+    FigureModule("fig1", "landscapes", "letters: the task, and the reward over the plane, ideal and learned"),
+    FigureModule("fig2", "vector-field", "letters: the learned reward's gradient around the current trajectory"),
+    FigureModule("fig3", "curricula", "segment lengths over epochs, under each curriculum", has_statistic=True),
+    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
+    FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
+    FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", has_statistic=True),
+    FigureModule("fig7", "noise", "mocap: test error against the predicted step, clean and noisy", has_statistic=True),
+    FigureModule(
+        "fig8", "alpha", "mocap: training over epochs for ranges of alpha", has_statistic=True, has_environment=True
+    ),
+    FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
+)
+
+FIGURES: dict[str, FigureModule] = {key: module for module in _MODULES for key in (module.name, module.alias)}
+
+
+def save(
+    name: str, record: FigureRecord, figure: "Figure", outdir: Path, formats: Sequence[str] = ("png",)
+) -> list[Path]:
+    """Write the figure in each of `formats` (png, pdf, svg) and the CSV of what it shows; return the paths, CSV last.
+
+    `name` is a key of FIGURES. Raises InputError for an unknown format or a folder that cannot be written.
+    """
+    from ssmail.plots.saving import save_figure
+
+    return save_figure(FIGURES[name].stem, record, figure, outdir, formats)

@@ -1,0 +1,123 @@
+"""The four kinds of statement that claims are made of, each with its test, its effect and its power calculation.
+
+A sample without runs, or with a value that is unknown, leaves a statement untested: its part says why.
+"""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ssmail.evaluation import order_statistics as orders
+from ssmail.evaluation.order_statistics import UNKNOWN, Estimate
+from ssmail.evaluation.power import seeds_for_every, seeds_for_rank_test, seeds_for_sign_test
+from ssmail.paper.claims import Part, Sample
+
+Side = Literal["below", "above"]
+
+LEAST_FOR_SPREAD = 2  # seeds; one has none
+
+
+class _Tested(NamedTuple):
+    """What a test found, by the names of Part."""
+
+    effect: Estimate
+    effect_is: str
+    p_for: float
+    p_against: float
+    seeds: int | None
+
+
+def every(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
+    """Every seed of a method is below (above) the bar: one counterexample contradicts it.
+
+    n of n seeds support it once they rule out that half of all seeds, or fewer, are: p = 2 ** -n, from five seeds on.
+    """
+
+    def tested() -> _Tested:
+        inside = _inside(sample, side, bar)
+        p = (0.5**inside, 1.0) if inside == len(sample.values) else (1.0, 0.0)
+        return _Tested(*_median(sample, side, bar), *p, seeds_for_every())
+
+    test = f"every seed {side} {bar:g}: exact binomial test against half of them; one seed that is not contradicts"
+    return _part(statement, statistic, test, (sample,), tested)
+
+
+def typical(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
+    """The median over all seeds of a method is below (above) the bar: sign test."""
+
+    def tested() -> _Tested:
+        found = orders.sign_test(sample.values, bar)
+        p = (found.less, found.greater) if side == "below" else (found.greater, found.less)
+        needed = seeds_for_sign_test(_inside(sample, side, bar) / len(sample.values))
+        return _Tested(*_median(sample, side, bar), *p, needed)
+
+    return _part(statement, statistic, f"exact sign test of the median, {side} {bar:g}", (sample,), tested)
+
+
+def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Part:
+    """Runs of `small` have smaller values than those of `great`: rank test, shift by Hodges and Lehmann."""
+
+    def tested() -> _Tested:
+        needed = seeds_for_rank_test(orders.superiority(small.values, great.values))
+        effect = orders.shift(small.values, great.values)
+        what = f"shift from {small.label} to {great.label} (Hodges-Lehmann)"
+        return _Tested(effect, what, *orders.rank_test(small.values, great.values), needed)
+
+    return _part(statement, statistic, "exact rank test (Wilcoxon, Mann, Whitney)", (small, great), tested)
+
+
+def steadier(statement: str, statistic: str, tight: Sample, wide: Sample) -> Part:
+    """Runs of `tight` spread less than those of `wide`: rank test of the distances from each group's own median.
+
+    It is Brown and Forsythe's test on ranks, without the structural zero of each group. The distances of one group are
+    not independent of each other, so its level is only nearly ALPHA (tests/evaluation/test_statements.py measures it).
+    """
+
+    def tested() -> _Tested:
+        near, far = orders.deviations(tight.values), orders.deviations(wide.values)
+        needed = seeds_for_rank_test(orders.superiority(near, far))
+        what = f"shift of the distance from the median, from {tight.label} to {wide.label} (Hodges-Lehmann)"
+        seeds = None if needed is None else needed + 1  # for the distance that is left out
+        return _Tested(orders.shift(near, far), what, *orders.rank_test(near, far), seeds)
+
+    test = "exact rank test of the distances from each group's median (Brown and Forsythe, structural zeros left out)"
+    return _part(statement, statistic, test, (tight, wide), tested, least=LEAST_FOR_SPREAD)
+
+
+def _inside(sample: Sample, side: Side, bar: float) -> int:
+    """How many values are beyond the bar on that side; one that is equal to it is not."""
+    values = np.array(sample.values)
+    return int((values < bar).sum() if side == "below" else (values > bar).sum())
+
+
+def _median(sample: Sample, side: Side, bar: float) -> tuple[Estimate, str]:
+    count = f"{_inside(sample, side, bar)} of {len(sample.values)} seeds"
+    return orders.median(sample.values), f"median ({count} {side} {bar:g})"
+
+
+def _part(
+    statement: str,
+    statistic: str,
+    test: str,
+    samples: tuple[Sample, ...],
+    tested: Callable[[], _Tested],
+    least: int = 1,
+) -> Part:
+    """The part, with what `tested` finds unless a sample lacks something."""
+    what = (statement, statistic, test, samples)
+    reasons = [text for sample in samples if (text := _lacking(sample, least))]
+    if reasons:
+        return Part(*what, UNKNOWN, "", 1.0, 1.0, reason="; ".join(reasons))
+    found = tested()
+    return Part(*what, found.effect, found.effect_is, found.p_for, found.p_against, seeds=found.seeds)
+
+
+def _lacking(sample: Sample, least: int) -> str:
+    """Why a sample cannot be tested, or nothing."""
+    if not sample.seeds:
+        return f"no runs of {sample.label}"
+    if sample.unknown:
+        several = "s" * (len(sample.unknown) > 1)
+        return f"unknown for seed{several} {', '.join(map(str, sample.unknown))} of {sample.label}"
+    return f"{len(sample.seeds)} seed of {sample.label} is too few" if len(sample.seeds) < least else ""

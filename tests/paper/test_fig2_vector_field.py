@@ -1,0 +1,97 @@
+"""Figure 2: the arrows, and the number of every seed."""
+
+import numpy as np
+import pytest
+
+from ssmail.errors import InputError
+from ssmail.paper.fig2_vector_field import AWAY, TOWARDS, collect, draw
+from ssmail.paper.results import FIGURES
+from ssmail.plots import NoRuns
+from ssmail.store import RunState, Store
+
+from .conftest import AddRun
+
+COSINES = {"[0,1]": (-0.6, 0.2, -0.8), "[-1,1]": (0.9, 0.6, 0.8)}
+
+
+@pytest.fixture
+def runs(add_landscapes: AddRun) -> dict[str, list[str]]:
+    """Three seeds of each range, with these cosines behind the trajectory."""
+    return {
+        alpha: [
+            add_landscapes(seed, behind=cosine, overrides=[f"self_supervision.alpha={alpha}"])
+            for seed, cosine in enumerate(found)
+        ]
+        for alpha, found in COSINES.items()
+    }
+
+
+def test_a_panel_for_each_range_shows_the_median_seed(store: Store, runs: dict[str, list[str]]) -> None:
+    record = collect(store)
+    assert [(field.label, field.run.id, field.epoch) for field in record.fields] == [
+        ("[0, 1]", runs["[0,1]"][0], 1),
+        ("[-1, 1]", runs["[-1,1]"][2], 1),
+    ]
+    assert len(record.provenance.run_ids) == 6
+    assert (
+        "alpha in [0, 1]: after epoch 1 the mean cosine behind the current trajectory is -0.60 (seed 0), 0.20"
+        in (record.notes[-2])
+    )
+
+
+def test_arrows_stand_on_tau_alpha_and_their_cosines_are_those_of_the_field(
+    store: Store, runs: dict[str, list[str]]
+) -> None:
+    record = collect(store)
+    field = record.fields[0]
+    np.testing.assert_allclose(field.places[..., 1], field.current[..., 1] + 3 * field.alpha[:, None, None, None])
+    np.testing.assert_allclose(field.cosine[:8], -0.6, atol=1e-3)
+    np.testing.assert_allclose(field.cosine[8:], 1.0, atol=1e-6)
+    table = record.table()
+    arrows = table[(table["kind"] == "arrow") & (table["seed"] == 0)]
+    assert arrows["alpha"].nunique() == 16
+    assert np.allclose(arrows["cosine"], np.where(arrows["alpha"] < 0, -0.6, 1.0), atol=1e-3)
+    numbers = table[table["kind"] == "number"]
+    assert sorted(numbers["behind_cosine"]) == sorted([*COSINES["[0,1]"], *COSINES["[-1,1]"]])
+
+
+def test_colours_tell_towards_from_away(store: Store, runs: dict[str, list[str]]) -> None:
+    from matplotlib.colors import to_hex
+    from matplotlib.quiver import Quiver
+
+    figure = draw(collect(store))
+    arrows = [
+        {to_hex(artist.get_facecolor()[0]): artist.N for artist in axes.get_children() if isinstance(artist, Quiver)}
+        for axes in figure.axes
+    ]
+    shown = 4 * 2  # steps and agents, for each alpha; from 0.75 on it is less than a grid cell to go
+    assert arrows[0] == {AWAY.lower(): 8 * shown, TOWARDS.lower(): 6 * shown}
+    assert arrows[1] == {TOWARDS.lower(): 14 * shown}
+
+
+def test_a_run_without_a_field(store: Store, add_landscapes: AddRun, runs: dict[str, list[str]]) -> None:
+    lacking = add_landscapes(7, behind=None, overrides=["self_supervision.alpha=[0,1]"])
+    with pytest.raises(InputError, match="has no landscape/behind_cosine yet"):
+        collect(store, [lacking])
+    add_landscapes(8, behind=None, state=RunState.DIVERGED, overrides=["self_supervision.alpha=[0,1]"])
+    diverged = store.runs(state="diverged")[0]
+    record = collect(store, [*runs["[0,1]"], diverged.id])
+    assert np.isnan(record.measured[-1].behind)
+    with pytest.raises(InputError, match=r"no run with alpha in \[0, 1\] has a vector field"):
+        collect(store, [diverged.id])
+
+
+def test_nothing_stored_names_the_command(store: Store) -> None:
+    with pytest.raises(NoRuns, match="ssmail ablate alpha --env"):
+        FIGURES["vector-field"].collect(store)
+
+
+def test_the_range_of_figure_1_is_left_out_unless_it_is_asked_for(
+    store: Store, add_landscapes: AddRun, runs: dict[str, list[str]]
+) -> None:
+    other = add_landscapes(behind=0.9)
+    record = collect(store)
+    assert [field.label for field in record.fields] == ["[0, 1]", "[-1, 1]"]
+    assert any("left out, for the figure compares [0, 1] and [-1, 1]: [-1, 1.5]." in note for note in record.notes)
+    asked = collect(store, [other, *runs["[0,1]"]])
+    assert [field.label for field in asked.fields] == ["[0, 1]", "[-1, 1.5]"]

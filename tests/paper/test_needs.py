@@ -1,0 +1,125 @@
+"""A compact export draws every figure exactly as the whole database does."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from ssmail.paper.needs import USUAL_CURVES, RecordingStore, needs
+from ssmail.paper.results import FIGURES
+from ssmail.plots import NoRuns
+from ssmail.store import RunState, Store
+from ssmail.store.maintenance.compact import Wanted, export_compact, settled_cells
+
+STARTS = 40
+
+
+@pytest.fixture
+def filled(store: Store, add_run: Any, ablate: Any, add_forecast: Any, vary_alpha: Any) -> Store:
+    """Runs for the figures, some with more starts than figure 5 shows, and others that no figure shows."""
+    vary_alpha({(0, 1): [0.01, None], (-1, 1): [0.003, 0.002]})
+    vary_alpha({(0, 1): [0.01]}, "yjunction")
+    for seed in (0, 1):
+        add_forecast(seed, 0.001, "dnri")
+    ablate("curriculum", {"teacher-forcing": [0.04, 0.03], "trajectory-forcing": [0.02, None]})
+    ablate("beta", {0.0: [0.04, 0.03], 0.4: [0.02, 0.01]})
+    rng = np.random.default_rng(0)
+    for seed in (0, 1):
+        rollouts = rng.normal(size=(3, STARTS, 5, 2, 2)).astype(np.float32)
+        lanes = rng.normal(size=(2, STARTS, 5, 2, 2)).astype(np.float32)
+        losses = {"discriminator/generated": [0.3, 0.2, 0.1], "discriminator/expert": [0.2, 0.2, 0.1]}
+        add_run(seed, epochs=losses, test__rollouts=rollouts, test__lanes=lanes)
+    add_run(2, [0.5], RunState.DIVERGED, epochs={name: [0.3] for name in losses})
+    add_run(3, state=RunState.INTERRUPTED)
+    add_run(0, method="dnri", overrides=["cloning.learning_rate=0.5"])
+    return store
+
+
+def tables(store: Store) -> dict[str, pd.DataFrame | str]:
+    """What each figure shows, or why it cannot."""
+    found: dict[str, pd.DataFrame | str] = {}
+    for name in {module.name: module for module in FIGURES.values()}:
+        try:
+            found[name] = FIGURES[name].collect(store).table()
+        except NoRuns:
+            found[name] = "no runs"
+    return found
+
+
+def exported(store: Store, target: Path, wanted: Wanted | None = None) -> Store:
+    runs = settled_cells(store.runs())
+    export_compact(store.where, target, runs, wanted or needs(store, runs).wanted)
+    return Store.open(target)
+
+
+def test_every_figure_is_drawn_from_an_export_as_from_the_whole(filled: Store, tmp_path: Path) -> None:
+    whole, small = tables(filled), exported(filled, tmp_path / "small.db")
+    assert sum(isinstance(table, pd.DataFrame) for table in whole.values()) >= 7
+    for name, table in tables(small).items():
+        if isinstance(table, pd.DataFrame):
+            pd.testing.assert_frame_equal(table, whole[name], obj=name)
+        else:
+            assert table == whole[name]
+    other = FIGURES["fig8"].collect(small, environment="yjunction").table()
+    pd.testing.assert_frame_equal(other, FIGURES["fig8"].collect(filled, environment="yjunction").table())
+    small.close()
+
+
+def test_without_what_they_need_the_figures_fail_or_differ(filled: Store, tmp_path: Path) -> None:
+    """Negative control: the test above can fail."""
+    bare = exported(filled, tmp_path / "bare.db", Wanted(curves=(), arrays={}))
+    assert len(FIGURES["fig4"].collect(bare).table()) < len(FIGURES["fig4"].collect(filled).table())
+    with pytest.raises(Exception, match="no array"):
+        FIGURES["fig5"].collect(bare)
+    bare.close()
+
+
+def test_only_what_is_read_is_wanted_and_of_rollouts_the_part_that_is_shown(filled: Store, tmp_path: Path) -> None:
+    runs = settled_cells(filled.runs())
+    wanted = needs(filled, runs).wanted
+    assert set(USUAL_CURVES) <= set(wanted.curves)
+    assert "actor/loss" not in wanted.curves
+    shown = FIGURES["fig5"].collect(filled).provenance.run_ids
+    drawn = [run for run, names in wanted.arrays.items() if "test/rollouts" in names]
+    assert set(drawn) <= set(shown)
+    small = exported(filled, tmp_path / "small.db")
+    assert {small.array(run, "test/rollouts").shape for run in drawn} == {(1, 16, 5, 2, 2), (1, 3, 5, 2, 2)}
+    small.close()
+
+
+def test_an_array_that_one_figure_needs_whole_is_kept_whole(filled: Store) -> None:
+    recorder = RecordingStore.open(filled.url)
+    run = next(run.id for run in filled.runs() if "test/lanes" in filled.array_names(run.id))
+    recorder.show([run])
+    recorder.thinnings = {"test/lanes": np.asarray}
+    recorder.array(run, "test/lanes")
+    assert recorder.arrays[run]["test/lanes"] is not None
+    recorder.thinnings = {}
+    recorder.array(run, "test/lanes")
+    assert recorder.arrays[run]["test/lanes"] is None
+    recorder.close()
+
+
+def test_figures_that_cannot_be_drawn_are_told(store: Store, add_run: Any) -> None:
+    add_run(0)
+    undrawable = needs(store, store.runs()).undrawable
+    assert {"fig3", "fig7", "fig8"} <= set(undrawable)
+    assert not {"fig4", "fig5", "fig9"} & set(undrawable)
+    assert undrawable["fig7"].startswith("fig7 has nothing to draw")
+
+
+def test_what_other_readers_need_is_kept_too_as_thin_as_figures_want_it(filled: Store) -> None:
+    runs = settled_cells(filled.runs())
+    shown = next(run for run, names in needs(filled, runs).wanted.arrays.items() if "test/rollouts" in names)
+
+    def read(store: Store) -> None:
+        store.metrics([shown], ["actor/loss"])
+        store.array(shown, "test/rollouts")
+        store.array(shown, "lane_centres")
+
+    wanted = needs(filled, runs, [read]).wanted
+    assert "actor/loss" in wanted.curves
+    assert wanted.arrays[shown]["test/rollouts"] is not None
+    assert wanted.arrays[shown]["lane_centres"] is None
