@@ -12,7 +12,7 @@ from ssmail.config.user_functions import UserFunction, pinned
 from ssmail.store import Store
 from ssmail_cli.main import run
 
-from .experiments_file import write
+from .config.experiments_file import write
 
 ROOT = Path(__file__).parents[1]
 TEXT = (ROOT / "docs" / "extending.md").read_text()
