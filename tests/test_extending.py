@@ -1,4 +1,4 @@
-"""docs/extending.md is true: its example is a file beside an experiments.yaml, and its commands train with it."""
+"""docs/extending.md is true: its example works beside an experiments.yaml, and its commands train with it."""
 
 import re
 import shlex
