@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ssmail.errors import unknown_name
+
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
 
@@ -14,7 +16,6 @@ DEFAULT_FORMATS = ["png"]
 
 def _known_formats(formats: list[str]) -> list[str]:
     """The formats as given. Raises InputError for one that figures are not written in."""
-    from ssmail.config.keys import unknown_name
     from ssmail.plots.provenance import FORMATS
 
     for name in formats:
@@ -36,7 +37,6 @@ Stat = Annotated[
 
 def parse_statistic(stat: str | None) -> "Statistic | None":
     """Return the statistic of that name. Raises InputError for an unknown one."""
-    from ssmail.config.keys import unknown_name
     from ssmail.evaluation.statistics import Statistic
 
     if stat is not None and stat not in list(Statistic):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail_cli.display import note
 from ssmail_cli.drawing import INCOMPLETE, draw_all
@@ -44,7 +44,6 @@ class FigureGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> None:
         """Parse each line with the command that it names, then run the commands."""
-        from ssmail.config.keys import unknown_name
 
         lines = ctx.meta["lines"]
         if not lines:
@@ -261,7 +260,6 @@ def _training_runs(
 ) -> "list[RunRow]":
     """Return the runs that meet every condition, newest last. Raises InputError for an unknown method or no run."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.config.keys import unknown_name
 
     runs = store.runs(ids=ids, environment=environment, profile=profile)
     for method in methods or []:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import training_options as options
@@ -128,7 +128,6 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.config.keys import unknown_name
     from ssmail.execution.figure_cells import figure_cells
 
     listed = load_experiments().figures

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ssmail.config.experiments_file import load_experiments
+from ssmail.paper import results
 from ssmail.paper.results import FIGURES
 from ssmail.plots import style
 
@@ -32,7 +33,7 @@ def test_names_and_aliases_lead_to_the_same_figure() -> None:
         "fig9": "fig9",
         "yjunction": "fig9",
     }
-    folder = Path(style.__file__).parent
+    folder = Path(results.__file__).parent
     assert {f"{module.stem}.py" for module in FIGURES.values()} == {path.name for path in folder.glob("fig[0-9]*.py")}
 
 
@@ -42,7 +43,7 @@ def test_every_figure_of_experiments_yaml_can_be_drawn() -> None:
 
 def test_importing_the_registry_imports_nothing_heavy() -> None:
     heavy = ("matplotlib", "pandas", "numpy", "sqlalchemy")
-    code = f"import sys, ssmail.figures; print([module for module in {heavy} if module in sys.modules])"
+    code = f"import sys, ssmail.paper.results; print([module for module in {heavy} if module in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

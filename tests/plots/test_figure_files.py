@@ -99,7 +99,7 @@ DRAW = """
 import json
 import sys
 from pathlib import Path
-from ssmail.figures import FIGURES, save
+from ssmail.paper.results import FIGURES, save
 from ssmail.store import Store
 store = Store.open(sys.argv[1])
 for name, formats in json.loads(sys.argv[3]).items():

@@ -10,9 +10,9 @@ from ssmail.errors import InputError
 from ssmail.plots import provenance
 from ssmail.plots.landscape_film import FILM, LANDSCAPE, collect, draw, save_film
 from ssmail.store import Store
+from tests.paper.handmade_landscapes import linear
 
 from .conftest import AddRun
-from .handmade_landscapes import linear
 
 
 def test_the_last_epoch_is_shown_unless_another_is_asked_for(store: Store, add_landscapes: AddRun) -> None:

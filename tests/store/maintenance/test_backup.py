@@ -75,7 +75,7 @@ def test_a_backup_during_writes_is_one_moment(store: Store, tmp_path: Path) -> N
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ssmail.store import backup
+from ssmail.store.maintenance import backup
 backup._copy = lambda path, partial: (partial.write_bytes(b"half"), os.kill(os.getpid(), signal.SIGKILL))
 backup.back_up(sys.argv[1], Path(sys.argv[2]))
 """

@@ -14,7 +14,7 @@ from ssmail.store import RunState, Store
 from ssmail.store.maintenance.checks import check
 from tests.store.databases import add, change, contents, files
 
-ASSET = Path(__file__).parent / "assets" / "schema_0001.sqlite"
+ASSET = Path(__file__).parents[1] / "assets" / "schema_0001.sqlite"
 
 
 @pytest.fixture

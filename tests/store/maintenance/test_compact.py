@@ -91,7 +91,8 @@ def test_an_export_overwrites_nothing_and_leaves_nothing_after_a_failure(store: 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ssmail.store import Store, compact
+from ssmail.store import Store
+from ssmail.store.maintenance import compact
 compact._shrink = lambda path: os.kill(os.getpid(), signal.SIGKILL)
 compact.export_compact(sys.argv[1], Path(sys.argv[2]), Store.open(sys.argv[1]).runs(), compact.Wanted((), {}))
 """

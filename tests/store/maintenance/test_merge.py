@@ -255,7 +255,7 @@ def test_a_failure_leaves_everything_as_it_was(
 
 KILLED = """
 import os, signal, sys
-from ssmail.store import merging
+from ssmail.store.maintenance import merge as merging
 from ssmail.store.checkpoint_files import CheckpointCopies
 owner = {"merging": merging, "files": CheckpointCopies}[sys.argv[3]]
 real, calls = getattr(owner, sys.argv[4]), []
