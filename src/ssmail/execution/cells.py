@@ -140,7 +140,7 @@ def plan_cell(store: Store, cell: Cell, settings: Settings) -> Plan:
         raise InputError(refusal(row, settings.stale_seconds))
     if settings.resume is Resume.NEVER:
         return Plan()
-    if row is not None and row.state in (RunState.FINISHED, RunState.DIVERGED):
+    if row is not None and row.state.settled:
         _check_data(cell, row)
         epochs = cell.spec.epochs
         epoch = epochs if row.state is RunState.FINISHED else 0

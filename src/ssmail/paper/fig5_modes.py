@@ -31,7 +31,7 @@ from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import SETTLED, Selection, select
+from ssmail.plots.selection import Selection, select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig5"
@@ -111,7 +111,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     """
     selection = select(store, NAME, runs, profile)
     for run in selection.runs:
-        if run.state not in SETTLED:
+        if not run.state.settled:
             raise InputError(f"run {run.name} ({run.state}) has no test rollouts; leave it out or train it to its end.")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = _expert(store, finished[0]) if finished else np.empty((0, 0, 0, 0, 2))

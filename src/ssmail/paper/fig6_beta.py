@@ -32,7 +32,7 @@ from ssmail.plots import style
 from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import SETTLED, Group
+from ssmail.plots.selection import Group
 from ssmail.store import Store
 from ssmail.store.comparison import latest_values
 
@@ -127,7 +127,7 @@ def collect(
 
 def _column(group: Group, values: Mapping[tuple[str, str], float], statistic: Statistic) -> Column:
     for run in group.runs:
-        if run.state not in SETTLED:
+        if not run.state.settled:
             raise InputError(f"run {run.name} ({run.state}) has no test error; leave it out or train it to its end.")
     error, balance = (
         np.array([values.get((run.id, name), np.nan) for run in group.runs], dtype=np.float64)

@@ -43,7 +43,7 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import SETTLED, Selection, select
+from ssmail.plots.selection import Selection, select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig7"
@@ -178,7 +178,7 @@ def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
     """How all of the runs are tested, as the section `forecast` of their specs says."""
     first = runs[0]
     for run in runs:
-        if run.state not in SETTLED:
+        if not run.state.settled:
             raise InputError(f"run {run.name} ({run.state}) has no test errors; leave it out or train it to its end.")
         differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"][key]]
         if differs:

@@ -15,7 +15,7 @@ from ssmail.config.experiments import Ablation, ablation, ablation_specs, as_wri
 from ssmail.config.keys import leaves
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns
-from ssmail.plots.selection import SETTLED, Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
+from ssmail.plots.selection import Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
 from ssmail.store import RunRow, Store
 
 _ABSENT = object()
@@ -79,7 +79,7 @@ def _family(store: Store, figure: str, needed: Ablation, profile: str | None) ->
     found: dict[Hashable, list[RunRow]] = {}
     current: dict[Hashable, bool] = {}
     for run in stored:
-        if run.state in SETTLED and value_of(run, needed.key) is not _ABSENT:
+        if run.state.settled and value_of(run, needed.key) is not _ABSENT:
             found.setdefault(rest_of(run, needed.key), []).append(run)
     for rest, runs in found.items():
         current[rest] = _is_current(needed, runs[0])
