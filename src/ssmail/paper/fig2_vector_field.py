@@ -25,7 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.experiments import ablation, as_written, figure_requirements
+from ssmail.config.experiments import ablation, display_value, figure_requirements
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import cosines
@@ -166,7 +166,9 @@ def _of_the_paper(selection: Selection) -> Selection:
     others = [group.label for group in selection.groups if group.value not in values]
     if not groups or not others:
         return selection
-    note = f"left out, for the figure compares {' and '.join(map(str, map(as_written, values)))}: {', '.join(others)}."
+    note = (
+        f"left out, for the figure compares {' and '.join(map(str, map(display_value, values)))}: {', '.join(others)}."
+    )
     return Selection(groups, (*selection.notes, note))
 
 

@@ -3,8 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmail.config.keys import unknown_name
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.paper.samples import Runs
