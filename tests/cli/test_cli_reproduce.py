@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ssmail.execution.figure_cells import figure_cells
+from ssmail.execution.planning import figure_cells
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.plots import provenance
 from ssmail.store import Store

@@ -39,7 +39,7 @@ def add(store: Store) -> AddRun:
         environment: str = "yjunction",
     ) -> str:
         spec = build_spec(method, environment, "smoke", overrides)
-        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
+        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
         for epoch in (1, 2, 3):
             losses = {"critic/loss": math.inf if epoch == 2 else 0.5}
             writer.epoch(epoch, {SHOWN[environment].validation: error * epoch, **losses})

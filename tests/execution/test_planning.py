@@ -9,7 +9,7 @@ from ssmail.config.experiments import ablation, build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError
 from ssmail.execution.cells import Cell
-from ssmail.execution.figure_cells import estimated_seconds, figure_cells, longest_first, total_seconds
+from ssmail.execution.planning import estimated_seconds, figure_cells, longest_first, total_seconds
 from ssmail.store import RunRow, Store
 
 

@@ -1,18 +1,16 @@
-"""What a run recorded, as plain rows: compared with that of another run, and carried into another database."""
+"""The rows that a run recorded: copied to another database, or compared with those of another run."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
-from sqlalchemy import Connection, Table, func, insert, select
+from sqlalchemy import ColumnElement, Connection, Table, func, insert, select
 
 from ssmail.store import schema
 from ssmail.store.queries import RunRow
 
 NOT_COMPARED = ("seconds",)
-"""Metrics that tell of the machine and not of the run."""
+"""Metrics that depend on the machine and not on the run."""
 CHILDREN = (schema.metric, schema.metric_latest, schema.array, schema.artifact)
-_ROWS = 500  # at a time
+_BATCH = 500  # rows per INSERT
 
 Value = tuple[str, float | None]  # kind, value
 Values = dict[tuple[int, str], Value]  # by step and name
@@ -20,9 +18,9 @@ Values = dict[tuple[int, str], Value]  # by step and name
 
 @dataclass(frozen=True)
 class Difference:
-    """Two runs of one cell that do not agree: the first metric that differs, by step and then by name.
+    """Two runs of one cell that disagree: the first metric that differs, ordered by step and then by name.
 
-    A value is None where that run has none, and text where it is not finite. `metric` may be `state`, at no step.
+    A value is None if that run has none, and a string if it is not finite. `metric` may be "state", with step None.
     """
 
     method: str
@@ -37,45 +35,45 @@ class Difference:
     left_out_value: float | str | None
 
 
+def copy_rows(source: Connection, target: Connection, table: Table, *conditions: ColumnElement[bool]) -> None:
+    """Insert the rows of `table` that meet the conditions into the same table of `target`."""
+    for batch in source.execute(select(table).where(*conditions)).mappings().partitions(_BATCH):
+        target.execute(insert(table), [dict(row) for row in batch])
+
+
+def copy_run(source: Connection, target: Connection, run_id: str) -> None:
+    """Insert the run with everything it recorded into `target`, which must not contain the run."""
+    copy_rows(source, target, schema.run, schema.run.c.id == run_id)
+    for table in CHILDREN:
+        copy_rows(source, target, table, table.c.run_id == run_id)
+
+
 def amount(connection: Connection, run_id: str) -> tuple[int, ...]:
-    """How much the run recorded, to be compared: its last step, and its rows in each table."""
+    """Return how much the run recorded, as a tuple to compare: its last step, then its rows in each table."""
     step = select(func.coalesce(func.max(schema.metric.c.step), 0)).where(schema.metric.c.run_id == run_id)
     counts = (select(func.count()).select_from(table).where(table.c.run_id == run_id) for table in CHILDREN)
     return tuple(int(connection.execute(query).scalar_one()) for query in (step, *counts))
 
 
 def first_difference(here: Connection, kept: RunRow, there: Connection, other: RunRow) -> Difference | None:
-    """Where two settled runs of one cell part first; None when they agree.
+    """Return the first difference between two finished or diverged runs of one cell; None when they agree.
 
-    They agree when they ended in the same state, with the same last value of every metric, and wherever both have a
-    value of the same metric and step it is the same; how long epochs took is not compared.
+    Runs agree if they ended in the same state with the same last value of every metric, and if all values that both
+    have for the same metric and step are equal. The duration of epochs is not compared.
     """
     ours, theirs = (_values(*pair, schema.metric) for pair in ((here, kept.id), (there, other.id)))
     our_last, their_last = (_values(*pair, schema.metric_latest) for pair in ((here, kept.id), (there, other.id)))
     common = ours.keys() & theirs.keys()  # a compact copy has fewer
     last = {key for key, _ in our_last.items() ^ their_last.items()}
     ours, theirs = ours | our_last, theirs | their_last
-    parted = {key for key in common | last if ours.get(key) != theirs.get(key)}
-    names = (kept.method, kept.environment, kept.seed, kept.spec_hash, kept.id, other.id)
-    if parted:
-        step, name = min(parted)
-        return Difference(*names, name, step, _shown(ours.get((step, name))), _shown(theirs.get((step, name))))
+    different = {key for key in common | last if ours.get(key) != theirs.get(key)}
+    identity = (kept.method, kept.environment, kept.seed, kept.spec_hash, kept.id, other.id)
+    if different:
+        step, name = min(different)
+        return Difference(*identity, name, step, _plain(ours.get((step, name))), _plain(theirs.get((step, name))))
     if kept.state is not other.state:
-        return Difference(*names, "state", None, kept.state.value, other.state.value)
+        return Difference(*identity, "state", None, kept.state.value, other.state.value)
     return None
-
-
-def carry(there: Connection, here: Connection, run_id: str) -> None:
-    """Insert the run's rows of every table of `there` into `here`, where there is no such run."""
-    for rows, table in _rows(there, run_id):
-        here.execute(insert(table), rows)
-
-
-def _rows(connection: Connection, run_id: str) -> Iterator[tuple[list[dict[str, Any]], Table]]:
-    for table in (schema.run, *CHILDREN):
-        key = table.c.id if table is schema.run else table.c.run_id
-        for part in connection.execute(select(table).where(key == run_id)).mappings().partitions(_ROWS):
-            yield [dict(row) for row in part], table
 
 
 def _values(connection: Connection, run_id: str, table: Table) -> Values:
@@ -84,7 +82,7 @@ def _values(connection: Connection, run_id: str, table: Table) -> Values:
     return {(step, name): (kind, value) for step, name, kind, value in rows}
 
 
-def _shown(value: Value | None) -> float | str | None:
+def _plain(value: Value | None) -> float | str | None:
     if value is None:
         return None
     kind, number = value
