@@ -1,11 +1,10 @@
-"""Looking at the reward that a learner climbs while it learns: over the plane, and around the current trajectory.
+"""Landscapes of the learned reward during training: over the plane, and around the current trajectory.
 
-Only planar environments and methods that learn a reward have landscapes. Looking changes nothing: the rollouts have a
-generator of their own, the same in every look.
+Only adversarial learners in planar environments have landscapes. Recording one does not change training: its rollouts
+use their own generator, which starts from the same seed every time.
 """
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -15,107 +14,99 @@ from ssmail.config.spec import RunSpec
 from ssmail.evaluation.landscape import Plane, closeness, mean_cosine, nearest_points, slope_share
 from ssmail.losses.self_supervision import mix, nearest
 from ssmail.models.features import Features
-from ssmail.training.experts import as_doubles
-from ssmail.training.learning import Learner, Predictor, Setting
+from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.batches import to_numpy
+from ssmail.training.learner import Learner, LearnerContext
 
-REFERENCES = 2  # training trajectories whose states stand in for what a point of the plane leaves open
-STATES = 24  # of a reference, evenly over its steps
-SHOWN = 16  # training trajectories that pictures show
-ROLLOUTS = 8  # current trajectories, from the starts of the first of the references
-CURRENT = 0.5  # the fraction of the epochs after which the policy is "the current one" of Figure 2
-BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # alphas of the points behind the current trajectory
-AHEAD = tuple(a / 8 for a in range(8))  # and of those on it and before it
+REFERENCES = 2  # training trajectories that supply everything but the agent's position at a point of the plane
+REFERENCE_STATES = 24  # of each reference, evenly over its steps
+EXPERTS_STORED = 16  # training trajectories stored for figures
+ROLLOUTS = 8  # current trajectories, from training starts
+CURRENT = 0.5  # the fraction of all epochs after which the policy is "the current one" of Figure 2
+ALPHAS_BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # of points behind the current trajectory
+ALPHAS_AHEAD = tuple(a / 8 for a in range(8))  # of points on the current trajectory and ahead of it
 
 Arrays = dict[str, np.ndarray]
 
 
-@runtime_checkable
-class RewardLearner(Protocol):
-    """A learner whose policy climbs a reward that it learns too."""
-
-    features: Features
-
-    @property
-    def predictor(self) -> Predictor:
-        """The policy."""
-        ...
-
-    def reward(self, x: Tensor, actions: Tensor) -> Tensor:
-        """(..., N) what the actor-critic is given for features (..., N, F) and actions (..., N, A)."""
-        ...
-
-
-def looks(spec: RunSpec) -> tuple[int, ...]:
-    """The epochs after which a landscape is kept, rising: 0 is the untrained model."""
-    kept = spec.evaluation.landscapes or 1
-    even = (round(spec.epochs * k / kept) for k in range(kept + 1))
+def landscape_epochs(spec: RunSpec) -> tuple[int, ...]:
+    """Return the epochs after which to record a landscape, in ascending order; 0 is the untrained model."""
+    count = spec.evaluation.landscapes or 1
+    even = (round(spec.epochs * k / count) for k in range(count + 1))
     return tuple(sorted({*even, current_epoch(spec)}))
 
 
 def current_epoch(spec: RunSpec) -> int:
-    """The epoch after which the policy is "the current one" of Figure 2."""
+    """Return the epoch after which the policy is "the current one" of Figure 2."""
     return max(1, round(CURRENT * spec.epochs))
 
 
 @dataclass(frozen=True)
-class Moments:
-    """Moments (...) of a group: its states (..., N, D) in scaled units, what is read beside them (..., N, F - D), and
-    the actions (..., N, A) as they are read.
+class RewardInputs:
+    """Everything that the reward reads of a group at some time steps (...).
+
+    states: (..., N, D), scaled.
+    other_features: (..., N, F - D), the features beside the state (time, start).
+    actions: (..., N, A), as the networks read them.
     """
 
     states: Tensor
-    beside: Tensor
+    other_features: Tensor
     actions: Tensor
 
     @classmethod
-    def of(cls, features: Features, states: Tensor, actions: Tensor) -> "Moments":
-        """Those of trajectories: states (B, T + 1, N, D), of which the last is left out, and actions (B, T, N, A)."""
-        beside = features(states[:, :-1], states[:, 0])[..., states.shape[-1] :]
-        return cls(states[:, :-1], beside, features.of_actions(actions))
+    def from_trajectories(cls, features: Features, states: Tensor, actions: Tensor) -> "RewardInputs":
+        """Take all steps of trajectories: states (B, T + 1, N, D) without the last, and actions (B, T, N, A)."""
+        other_features = features(states[:, :-1], states[:, 0])[..., states.shape[-1] :]
+        return cls(states[:, :-1], other_features, features.of_actions(actions))
 
 
-def position_gradient(learner: RewardLearner, at: Moments, agent: int) -> tuple[Tensor, Tensor]:
-    """The agent's reward (...) at moments (...) and its gradient (..., 2) with respect to the agent's own position,
-    everything else held.
+def position_gradient(learner: AdversarialLearner, at: RewardInputs, agent: int) -> tuple[Tensor, Tensor]:
+    """Return the agent's reward (...), and its gradient (..., 2) with respect to the agent's own position.
+
+    Everything else is held fixed. The gradient is in scaled units.
     """
     position = at.states[..., agent, :2].detach().clone().requires_grad_()
     moved = at.states.detach().clone()
     moved[..., agent, :2] = position
-    x = torch.cat([learner.features.read(moved), at.beside], dim=-1)
+    x = torch.cat([learner.features.read(moved), at.other_features], dim=-1)
     values = learner.reward(x, at.actions)[..., agent]
     (gradient,) = torch.autograd.grad(values.sum(), position)
     return values.detach(), gradient
 
 
-class Landscapes:
-    """What is seen of one run. All arrays are scaled but for those whose names say otherwise."""
+class LandscapeRecorder:
+    """Computes the landscapes of one run."""
 
-    def __init__(self, setting: Setting, learner: RewardLearner) -> None:
-        self.setting, self.learner = setting, learner
-        experts = setting.experts
-        chosen = torch.as_tensor(_spread(len(experts), REFERENCES), device=setting.device)
-        steps = torch.as_tensor(_spread(setting.steps, STATES), device=setting.device)
+    def __init__(self, context: LearnerContext, learner: AdversarialLearner) -> None:
+        self.context, self.learner = context, learner
+        experts = context.experts
+        chosen = torch.as_tensor(_spread(len(experts), REFERENCES), device=context.device)
+        steps = torch.as_tensor(_spread(context.steps, REFERENCE_STATES), device=context.device)
         states = experts.states[chosen]
-        all_steps = Moments.of(learner.features, states, experts.actions[chosen])
-        self.references = Moments(*(part[:, steps].flatten(0, 1) for part in vars(all_steps).values()))  # (K)
+        all_steps = RewardInputs.from_trajectories(learner.features, states, experts.actions[chosen])
+        self.references = RewardInputs(*(part[:, steps].flatten(0, 1) for part in vars(all_steps).values()))  # (K)
         self.agents = states.shape[2]
-        everywhere = as_doubles(experts.states[..., :2])  # (B, T + 1, N, 2)
+        everywhere = to_numpy(experts.states[..., :2])  # (B, T + 1, N, 2)
         self.plane = Plane.around(everywhere)
         points, tracks = self.plane.points, [everywhere[:, :, n].reshape(-1, 2) for n in range(self.agents)]
-        self.ways = np.stack([nearest_points(points, track) - points for track in tracks])
-        places = [as_doubles(self.references.states[:, n, :2]) for n in range(self.agents)]
+        self.to_expert = np.stack([nearest_points(points, track) - points for track in tracks])
+        places = [to_numpy(self.references.states[:, n, :2]) for n in range(self.agents)]
         self.weights = torch.as_tensor(np.stack([closeness(points, place) for place in places]))
 
     @classmethod
-    def of(cls, setting: Setting, learner: Learner) -> "Landscapes | None":
-        """Those of a learner, or None where there is no plane or no reward."""
-        planar = setting.experts.actions.shape[-1] == 2
-        return cls(setting, learner) if planar and isinstance(learner, RewardLearner) else None
+    def for_learner(cls, context: LearnerContext, learner: Learner) -> "LandscapeRecorder | None":
+        """Make the recorder of a learner, or return None if there is no plane or no reward."""
+        planar = context.experts.actions.shape[-1] == 2
+        return cls(context, learner) if planar and isinstance(learner, AdversarialLearner) else None
 
-    def look(self, epoch: int) -> tuple[dict[str, float], Arrays]:
-        """The numbers and the arrays of the model as it is after `epoch` epochs; see docs/database.md."""
+    def record(self, epoch: int) -> tuple[dict[str, float], Arrays]:
+        """Return the metrics and arrays of the current model, after `epoch` epochs; see docs/database.md.
+
+        Epoch 0 also has what all landscapes share; epoch `current_epoch` also has the vector field of Figure 2.
+        """
         made = self.rollouts()
-        reward, gradient = self.field()
+        reward, gradient = self.reward_field()
         prefix = f"landscape/{epoch:04d}"
         arrays = {
             f"{prefix}/reward": _half(reward),
@@ -123,20 +114,21 @@ class Landscapes:
             f"{prefix}/rollouts": _half(self._raw(made)),
         }
         if epoch == 0:
-            return {}, {**self._frame(), **arrays}
+            return {}, {**self._shared_arrays(), **arrays}
         values = {
             "landscape/slope_share": slope_share(reward, gradient, self.plane),
-            "landscape/cosine": mean_cosine(gradient, self.ways, self.plane.spacing),
+            "landscape/cosine": mean_cosine(gradient, self.to_expert, self.plane.spacing),
         }
-        if epoch == current_epoch(self.setting.spec):
-            more, around = self.around(made)
-            values, arrays = values | more, arrays | around
+        if epoch == current_epoch(self.context.spec):
+            more_values, more_arrays = self.vector_field(made)
+            values, arrays = values | more_values, arrays | more_arrays
         return values, arrays
 
-    def field(self) -> tuple[np.ndarray, np.ndarray]:
-        """The reward (N, H, W) of each agent over the plane and its gradient (N, H, W, 2).
+    def reward_field(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return each agent's reward (N, H, W) over the plane, and its gradient (N, H, W, 2).
 
-        The agent is put on each point; all else is that of the nearest of its own positions in the references.
+        The agent is put on each point of the plane. Everything else comes from the K reference states, whose rewards
+        are averaged with weights by the distance between the point and the agent's position there.
         """
         known = self.references
         points = torch.as_tensor(self.plane.points, dtype=known.states.dtype, device=known.states.device)
@@ -145,64 +137,67 @@ class Landscapes:
         for agent, weights in enumerate(self.weights):
             states = here[0].clone()
             states[..., agent, :2] = points.unsqueeze(2)
-            reward, gradient = position_gradient(self.learner, Moments(states, *here[1:]), agent)
+            reward, gradient = position_gradient(self.learner, RewardInputs(states, *here[1:]), agent)
             rewards.append((weights * _double(reward)).sum(dim=2))
             gradients.append((weights.unsqueeze(-1) * _double(gradient)).sum(dim=2))
         return torch.stack(rewards).numpy(), torch.stack(gradients).numpy()
 
     def rollouts(self) -> Tensor:
-        """(ROLLOUTS, T + 1, N, D) states of the current policy, sampled, from the starts of some references."""
-        generator = torch.Generator().manual_seed(self.setting.generators.seeds["evaluation"])
-        starts = self.setting.experts.states[_spread(len(self.setting.experts), ROLLOUTS), :1]
-        return self.learner.predictor.free_run(starts, self.setting.steps, generator)
+        """Sample states (ROLLOUTS, T + 1, N, D) of the current policy from training starts."""
+        generator = torch.Generator().manual_seed(self.context.generators.seeds["evaluation"])
+        starts = self.context.experts.states[_spread(len(self.context.experts), ROLLOUTS), :1]
+        return self.learner.predictor.free_run(starts, self.context.steps, generator)
 
-    def around(self, made: Tensor) -> tuple[dict[str, float], Arrays]:
-        """The gradient at the states and actions of tau_alpha, between the rollouts `made` and the expert trajectory
-        nearest to each: its mean cosine with the way to that expert's position at the same step, and the arrays.
+    def vector_field(self, made: Tensor) -> tuple[dict[str, float], Arrays]:
+        """Return the reward's gradient around the rollouts `made` (R, T + 1, N, D): Figure 2.
+
+        The gradient is taken at the states and actions of tau_alpha, between each rollout and the nearest expert
+        trajectory. The metrics are its mean cosine with the direction to that expert's position at the same step,
+        behind and ahead of the rollouts.
         """
-        experts = self.setting.experts[nearest(made, self.setting.experts.states)]
-        alphas = torch.tensor([*BEHIND, *AHEAD], device=made.device)
+        experts = self.context.experts[nearest(made, self.context.experts.states)]
+        alphas = torch.tensor([*ALPHAS_BEHIND, *ALPHAS_AHEAD], device=made.device)
         count, rollouts = len(alphas), len(made)
         each = alphas.repeat_interleave(rollouts)
         states = mix(made.repeat(count, 1, 1, 1), experts.states.repeat(count, 1, 1, 1), each)
         taken = made[:, 1:, :, 2:]  # the environment's actions are the next velocities
         actions = mix(taken.repeat(count, 1, 1, 1), experts.actions.repeat(count, 1, 1, 1), each)
-        at = Moments.of(self.learner.features, states, actions)
+        at = RewardInputs.from_trajectories(self.learner.features, states, actions)
         found = [position_gradient(self.learner, at, agent)[1] for agent in range(self.agents)]
-        gradient = as_doubles(torch.stack(found, dim=2)).reshape(count, rollouts, -1, self.agents, 2)
-        here = as_doubles(states[:, :-1, :, :2]).reshape(gradient.shape)
-        ways = as_doubles(experts.states[:, :-1, :, :2]) - here
-        behind = slice(len(BEHIND))
+        gradient = to_numpy(torch.stack(found, dim=2)).reshape(count, rollouts, -1, self.agents, 2)
+        here = to_numpy(states[:, :-1, :, :2]).reshape(gradient.shape)
+        to_expert = to_numpy(experts.states[:, :-1, :, :2]) - here
+        behind, ahead = slice(len(ALPHAS_BEHIND)), slice(len(ALPHAS_BEHIND), None)
         values = {
-            "landscape/behind_cosine": mean_cosine(gradient[behind], ways[behind], self.plane.spacing),
-            "landscape/ahead_cosine": mean_cosine(gradient[len(BEHIND) :], ways[len(BEHIND) :], self.plane.spacing),
+            "landscape/behind_cosine": mean_cosine(gradient[behind], to_expert[behind], self.plane.spacing),
+            "landscape/ahead_cosine": mean_cosine(gradient[ahead], to_expert[ahead], self.plane.spacing),
         }
         arrays = {
-            "vector_field/alpha": as_doubles(alphas),
+            "vector_field/alpha": to_numpy(alphas),
             "vector_field/gradient": _half(gradient),
             "vector_field/current": self._raw(made[:, :-1]),
             "vector_field/expert": self._raw(experts.states[:, :-1]),
         }
         return values, arrays
 
-    def _frame(self) -> Arrays:
-        """What all looks share, in raw units: the axes of the plane, the length of a scaled unit, some experts."""
-        scaling = self.setting.integrator.scaling
+    def _shared_arrays(self) -> Arrays:
+        """Return the plane's axes, the length of a scaled unit, and some experts, in raw units."""
+        scaling = self.context.integrator.scaling
         axes = {name: scaling.unscale_positions(getattr(self.plane, name)).astype(np.float32) for name in ("x", "y")}
-        expert = self._raw(self.setting.experts.states[_spread(len(self.setting.experts), SHOWN)])
+        expert = self._raw(self.context.experts.states[_spread(len(self.context.experts), EXPERTS_STORED)])
         unit = np.array([scaling.position_span / 2])
         return {"landscape/x": axes["x"], "landscape/y": axes["y"], "landscape/unit": unit, "landscape/expert": expert}
 
     def _raw(self, states: Tensor) -> np.ndarray:
-        """Raw positions (..., 2) of scaled states."""
-        raw: np.ndarray = self.setting.integrator.scaling.unscale_positions(as_doubles(states[..., :2])).astype(
+        """Return raw positions (..., 2) of scaled states."""
+        raw: np.ndarray = self.context.integrator.scaling.unscale_positions(to_numpy(states[..., :2])).astype(
             np.float32
         )
         return raw
 
 
 def _spread(length: int, count: int) -> np.ndarray:
-    """Up to `count` indices, evenly from the first of `length` to the last."""
+    """Return up to `count` indices, evenly spaced from 0 to length - 1."""
     return np.linspace(0, length - 1, min(count, length)).round().astype(int)
 
 
@@ -211,7 +206,7 @@ def _double(tensor: Tensor) -> Tensor:
 
 
 def _half(values: np.ndarray) -> np.ndarray:
-    """For pictures: three digits, and within the finite numbers of float16 whatever is finite."""
+    """Convert to float16 for figures. Finite values stay finite."""
     largest = np.finfo(np.float16).max
     finite = np.isfinite(values)
     return np.where(finite, np.clip(values, -largest, largest), values).astype(np.float16)

@@ -1,6 +1,6 @@
-"""What the training loop asks of a method: something that learns, and something that predicts."""
+"""The interfaces between the training loop and a method: a Learner trains, its Predictor is evaluated."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -9,13 +9,13 @@ from torch import Tensor, nn
 
 from ssmail.config.spec import RunSpec
 from ssmail.envs.integrator import Integrator
-from ssmail.training.replay import Batch
+from ssmail.training.batches import Batch
 from ssmail.training.seeding import Generators
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What a learner is made from. `experts` holds the scaled training trajectories; all tensors are on its device."""
+class LearnerContext:
+    """Everything that a learner is built from. `experts` holds the training split, scaled, on the learner's device."""
 
     spec: RunSpec
     experts: Batch
@@ -24,17 +24,22 @@ class Setting:
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """The device of all tensors."""
         return self.experts.states.device
 
     @property
     def steps(self) -> int:
-        """Actions in a trajectory."""
+        """The number of actions in a training trajectory."""
         return self.experts.actions.shape[1]
 
 
 class Predictor(Protocol):
-    """Predicts trajectories in scaled units, from the weights that it has now."""
+    """Predicts trajectories in scaled units with its model's current weights."""
+
+    @property
+    def model(self) -> nn.Module:
+        """The network whose weights the loop keeps for the best epoch."""
+        ...
 
     def free_run(
         self,
@@ -45,20 +50,26 @@ class Predictor(Protocol):
         deterministic: bool = False,
         noise: Tensor | None = None,
     ) -> Tensor:
-        """States (B, steps + 1, N, D): the last of those `observed` (B, H, N, D), then each predicted from the
-        predictions before. `noise` (B, H + steps - 1, N, D) is added to every state that is read.
+        """Predict `steps` states from the `observed` ones (B, H, N, D), feeding each prediction back as input.
+
+        Returns (B, steps + 1, N, D): the last observed state and the predictions. `noise` (B, H + steps - 1, N, D) is
+        added to every state that the predictor reads. `deterministic` replaces sampled actions by their means.
         """
         ...
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
-        """(B, T, N, D): the mean prediction of states[:, 1:] from states (B, T + 1, N, D), each from the true past."""
+        """Predict the mean of states[:, 1:] from states (B, T + 1, N, D), each from its true past: (B, T, N, D)."""
         ...
+
+
+class Stateful(Protocol):
+    """Anything that a checkpoint saves: networks, optimizers, buffers."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The weights."""
+        """Return the state as tensors and plain data."""
         ...
 
-    def load_state_dict(self, state: dict[str, Any]) -> object:
+    def load_state_dict(self, state: Any, /) -> object:
         """Inverse of `state_dict`."""
         ...
 
@@ -68,21 +79,17 @@ class Learner(Protocol):
 
     @property
     def predictor(self) -> Predictor:
-        """What is evaluated, with the weights of now."""
+        """The predictor to evaluate, with the current weights."""
         ...
 
     def networks(self) -> Iterable[nn.Module]:
-        """All networks that learn; a weight that is not finite ends the run as diverged."""
+        """Return all trained networks. A weight that is not finite ends the run as diverged."""
         ...
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Train for epoch 0 .. epochs - 1 and return its metrics."""
         ...
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that an epoch changes, but for the generators: tensors and plain data only."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
+    def parts(self) -> Mapping[str, Stateful]:
+        """Return everything that an epoch changes, except the generators, under its name in a checkpoint."""
         ...
