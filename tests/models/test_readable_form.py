@@ -1,5 +1,5 @@
-"""The networks of nri and dnri against their plain edge-gather form (benchmarks/edge_gather.py): equal to float
-precision, forward and gradients, with and without batch norm.
+"""Every network in its readable form (message_passing.FAST off) against its fast form: equal to float precision, values
+and gradients, with and without batch norm.
 """
 
 import copy
@@ -8,15 +8,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from benchmarks.edge_gather import (
-    GatherDynamicEncoder,
-    GatherMessageDecoder,
-    GatherRecurrentDecoder,
-    GatherStaticEncoder,
-)
-from ssmail.models import edge_layers, edge_memory, variational_encoder
+from ssmail.models import decoders, fast_messages, message_passing, variational_encoder
+from ssmail.models.critic import TwinCritic
 from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
+from ssmail.models.discriminator import Discriminator
+from ssmail.models.policy import Actor
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from tests.models.test_message_passing import SPEC
 from tests.models.test_variational_encoder import spec
 
 agents = pytest.mark.parametrize("n", [1, 2, 3, 4, 5])
@@ -35,13 +33,23 @@ def outputs_and_gradients(network: nn.Module, *inputs: Tensor) -> list[Tensor]:
     return [*outputs, *filled]
 
 
-def assert_same(dense: nn.Module, gather: type[nn.Module], *inputs: Tensor) -> None:
-    dense = dense.double()
-    plain = gather(copy.deepcopy(dense))
+def in_readable_form(network: nn.Module, *inputs: Tensor) -> list[Tensor]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(message_passing, "FAST", False)
+        patch.setattr(decoders, "EdgeLayers", None)  # so that the comparison is not of one form with itself
+        patch.setattr(variational_encoder, "EdgeLayers", None)
+        patch.setattr(variational_encoder, "both_ways", None)
+        patch.setattr(message_passing, "sum_over_senders", None)
+        return outputs_and_gradients(network, *inputs)
+
+
+def assert_same(fast: nn.Module, *inputs: Tensor) -> None:
+    fast = fast.double()
+    readable = copy.deepcopy(fast)
     inputs = tuple(i.double() for i in inputs)
-    for ours, theirs in zip(outputs_and_gradients(dense, *inputs), outputs_and_gradients(plain, *inputs), strict=True):
+    for ours, theirs in zip(outputs_and_gradients(fast, *inputs), in_readable_form(readable, *inputs), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-11)
-    for ours, theirs in zip(dense.buffers(), plain.buffers(), strict=True):
+    for ours, theirs in zip(fast.buffers(), readable.buffers(), strict=True):
         if ours.is_floating_point():  # the running statistics
             torch.testing.assert_close(ours, theirs, rtol=1e-9, atol=1e-11)
 
@@ -52,19 +60,19 @@ def assert_same(dense: nn.Module, gather: type[nn.Module], *inputs: Tensor) -> N
 def test_encoders(n: int, batch_norm: bool, training: bool) -> None:
     torch.manual_seed(n)
     x = torch.randn(3, 4, n, 5)
-    for network, gather in ((DynamicEncoder, GatherDynamicEncoder), (StaticEncoder, GatherStaticEncoder)):
-        assert_same(network(5, spec(batch_norm=batch_norm)).train(training), gather, x)
+    for network in (DynamicEncoder, StaticEncoder):
+        assert_same(network(5, spec(batch_norm=batch_norm)).train(training), x)
 
 
-def test_encoders_in_parts_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_encoders_in_chunks_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """As larger systems are computed."""
-    monkeypatch.setattr(edge_memory, "ONE_BY_ONE_UP_TO", 0)
-    monkeypatch.setattr(edge_layers, "CHUNK", 2 * 4 * 3 * 8)
+    monkeypatch.setattr(fast_messages, "ONE_BY_ONE_UP_TO", 0)
+    monkeypatch.setattr(fast_messages, "CHUNK", 2 * 4 * 3 * 8)
     monkeypatch.setattr(variational_encoder, "CHUNK", 2 * 3 * 4 * 4 * 6)
     torch.manual_seed(0)
     x = torch.randn(3, 5, 4, 5)
-    for network, gather in ((DynamicEncoder, GatherDynamicEncoder), (StaticEncoder, GatherStaticEncoder)):
-        assert_same(network(5, spec()), gather, x)
+    for network in (DynamicEncoder, StaticEncoder):
+        assert_same(network(5, spec()), x)
 
 
 @agents
@@ -73,22 +81,44 @@ def test_encoders_in_parts_and_with_both_lstms_in_one(monkeypatch: pytest.Monkey
 def test_decoders(n: int, first_type_is_none: bool, graph_steps: int) -> None:
     torch.manual_seed(n)
     x, graph = torch.randn(3, 4, n, 5), torch.softmax(torch.randn(3, graph_steps, n, n, 3), dim=-1)
-    for network, gather in ((MessageDecoder, GatherMessageDecoder), (RecurrentDecoder, GatherRecurrentDecoder)):
-        assert_same(network(5, 2, spec(first_type_is_none=first_type_is_none)), gather, x, graph)
+    for network in (MessageDecoder, RecurrentDecoder):
+        assert_same(network(5, 2, spec(first_type_is_none=first_type_is_none)), x, graph)
+
+
+class ActorDistribution(nn.Module):
+    """The distribution of an actor as the output of a module."""
+
+    def __init__(self, actor: Actor) -> None:
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, x: Tensor, graph: Tensor) -> tuple[Tensor, Tensor]:
+        return self.actor.distribution(x, graph)
+
+
+@pytest.mark.parametrize("n", [1, 2, 4, 10])
+@pytest.mark.parametrize("first_type_is_none", [True, False])
+def test_networks_of_the_graph_policy(n: int, first_type_is_none: bool) -> None:
+    torch.manual_seed(n)
+    model = SPEC.model_copy(update={"first_type_is_none": first_type_is_none})
+    x, action, graph = torch.randn(2, 3, n, 5), torch.randn(2, 3, n, 2), torch.rand(2, 3, n, n, 3)
+    assert_same(ActorDistribution(Actor(5, 2, model)), x, graph)
+    assert_same(TwinCritic(7, model), x, action, graph)
+    assert_same(Discriminator(7, 8), x, action)
 
 
 def test_single_precision() -> None:
     torch.manual_seed(0)
-    dense, x = DynamicEncoder(5, spec()), torch.randn(3, 4, 4, 5)
-    for ours, theirs in zip(dense(x), GatherDynamicEncoder(copy.deepcopy(dense))(x), strict=True):
+    fast, x = DynamicEncoder(5, spec()), torch.randn(3, 4, 4, 5)
+    for ours, theirs in zip(fast(x), in_readable_form(copy.deepcopy(fast), x)[:2], strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_the_comparison_can_fail() -> None:
-    """Negative control: with the ends of every edge exchanged, or a single weight changed, the forms differ."""
+    """Negative control: with the ends of every edge exchanged the forms differ."""
     torch.manual_seed(0)
-    dense, x = DynamicEncoder(5, spec()), torch.randn(3, 4, 4, 5)
-    changed = copy.deepcopy(dense)
+    fast, x = DynamicEncoder(5, spec()), torch.randn(3, 4, 4, 5)
+    changed = copy.deepcopy(fast)
     edges = changed.embedding.edges_out
     edges.sender.weight.data, edges.receiver.weight.data = edges.receiver.weight.data, edges.sender.weight.data
-    assert not torch.allclose(dense(x)[0], GatherDynamicEncoder(changed)(x)[0], atol=1e-3)
+    assert not torch.allclose(fast(x)[0], in_readable_form(changed, x)[0], atol=1e-3)

@@ -1,4 +1,4 @@
-"""Units of an agent's own: what is usual for it, and how far it usually strays."""
+"""Per-agent normalization of features, and the bounds on actions that follow from it."""
 
 from dataclasses import dataclass
 
@@ -7,47 +7,48 @@ from torch import Tensor
 
 from ssmail.config.sections import ModelSpec
 
-SMALLEST = 0.1  # of the mean spread: what hardly moves is not blown up beyond this
-
-FARTHEST = 5.0  # spreads from the mean
+STD_FLOOR = 0.1  # smallest standard deviation, as a fraction of the mean over agents: noise is not blown up beyond this
+CLIP = 5.0  # standard deviations from the mean
 
 
 @dataclass(frozen=True)
-class Standards:
-    """Mean and spread over the training set, for each agent and feature, scaled units.
+class Normalization:
+    """Per-agent mean and standard deviation of the state features over the training set.
 
-    mean, spread: (N, D) of the state features as they are read, positions relative to the root where that is so.
+    mean, std: (N, D), of the features as networks read them: scaled, and relative to the root where the spec says so.
     """
 
     mean: Tensor
-    spread: Tensor
+    std: Tensor
 
     @classmethod
-    def of(cls, read: Tensor) -> "Standards":
-        """Those of training states as they are read, (M, T, N, D)."""
-        std, mean = torch.std_mean(read.double(), dim=(0, 1))
-        return cls(mean.to(read.dtype), _floored(std).to(read.dtype))
+    def fit(cls, states: Tensor) -> "Normalization":
+        """Fit to training states (M, T, N, D). A feature that never varies gets a standard deviation of 1."""
+        std, mean = torch.std_mean(states.double(), dim=(0, 1))
+        floored = std.maximum(STD_FLOOR * std.mean(dim=0))
+        std = torch.where(floored > 0, floored, torch.ones_like(floored))
+        return cls(mean.to(states.dtype), std.to(states.dtype))
 
     @property
-    def velocity(self) -> "Standards":
-        """Those of the velocities alone, (N, A) each."""
-        return Standards(self.mean.chunk(2, dim=-1)[1], self.spread.chunk(2, dim=-1)[1])
+    def velocity(self) -> "Normalization":
+        """The normalization of the velocities alone, (N, A) each."""
+        return Normalization(self.mean.chunk(2, dim=-1)[1], self.std.chunk(2, dim=-1)[1])
 
-    def standardize(self, read: Tensor) -> Tensor:
-        """State features (..., N, D) in units of their spread, about their mean; what is farther than FARTHEST counts
-        as that far, so that single wrong frames do not stand out beyond all else.
+    def normalize(self, states: Tensor) -> Tensor:
+        """Return (x - mean) / std of state features (..., N, D), clipped to +-CLIP so that single bad frames do not
+        dominate.
         """
-        return ((read - self.mean) / self.spread).clamp(-FARTHEST, FARTHEST)
+        return ((states - self.mean) / self.std).clamp(-CLIP, CLIP)
 
-    def restore(self, standardized: Tensor) -> Tensor:
-        """Inverse of `standardize`, within FARTHEST."""
-        return self.mean + self.spread * standardized
+    def denormalize(self, normalized: Tensor) -> Tensor:
+        """Invert `normalize`, up to the clipping."""
+        return self.mean + self.std * normalized
 
 
 @dataclass(frozen=True)
-class Reach:
-    """Which velocities an action can choose, scaled units: at most `step` from the current one, and between `low` and
-    `high`. Each is (N, A), or a scalar for all.
+class ActionBounds:
+    """The velocities that an action can choose, in scaled units: at most `step` from the current velocity, and between
+    `low` and `high`. Each is (N, A), or a scalar for all agents.
     """
 
     step: Tensor
@@ -55,17 +56,13 @@ class Reach:
     high: Tensor
 
     @classmethod
-    def of(cls, spec: ModelSpec, standards: Standards | None = None) -> "Reach":
-        """Those of a spec: in scaled units, or with standards in units of the agent's own."""
-        if standards is None:
+    def of(cls, spec: ModelSpec, normalization: Normalization | None = None) -> "ActionBounds":
+        """Return the bounds of a spec, which are in scaled units or, with a normalization, in standard deviations
+        around each agent's mean velocity.
+        """
+        if normalization is None:
             bound = torch.tensor(spec.action_bound)
             return cls(torch.tensor(spec.action_step), -bound, bound)
-        usual = standards.velocity
-        away = spec.action_bound * usual.spread
-        return cls(spec.action_step * usual.spread, usual.mean - away, usual.mean + away)
-
-
-def _floored(spread: Tensor) -> Tensor:
-    """(N, D) spreads, none of them below SMALLEST of the mean of their feature; 1 for a feature that never varies."""
-    floored = spread.maximum(SMALLEST * spread.mean(dim=0))
-    return torch.where(floored > 0, floored, torch.ones_like(floored))
+        velocity = normalization.velocity
+        margin = spec.action_bound * velocity.std
+        return cls(spec.action_step * velocity.std, velocity.mean - margin, velocity.mean + margin)
