@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import VariationalSpec, used
+from ssmail.config.sections import VariationalSpec, required
 from ssmail.losses.likelihood import variational_loss
 from ssmail.models import message_passing
 from ssmail.models.decoders import make_decoder
@@ -61,7 +61,7 @@ def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, sp
 def works_of(name: str) -> dict[str, Work]:
     """What is timed, by name."""
     (b, t, n, p), hidden, memory, decoder_name = CASES[name]
-    spec = used(build_spec("dnri", "yjunction", "quick").variational).model_copy(
+    spec = required(build_spec("dnri", "yjunction", "quick").variational).model_copy(
         update={"hidden": hidden, "memory": memory, "decoder": decoder_name, "decoder_hidden": hidden}
     )
     torch.manual_seed(0)

@@ -72,7 +72,16 @@ def make_learner(
     experts = Batch(experts.states.to(dtype), experts.actions.to(dtype), experts.source)
     learner = VariationalLearner(Setting(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
     learner.model.to(dtype)
-    message_passing.FAST = form == "fast"
+    update = learner._update
+
+    def in_form(*forcing: Tensor) -> dict[str, float]:
+        message_passing.FAST = form == "fast"
+        try:
+            return update(*forcing)
+        finally:
+            message_passing.FAST = True
+
+    learner._update = in_form
     return learner
 
 

@@ -136,6 +136,7 @@ def test_downloaded_files_are_a_source(
     with misbehaving_site.serving() as site:
         monkeypatch.setattr(download, "BASE_URL", site.url)
         site.files = {f"/subjects/35/{file.name}": file.read_bytes() for file in folder.iterdir()}
+        monkeypatch.setattr(download, "SHA256", misbehaving_site.digests(site))
         outcome = cli(*options)
         assert (outcome.code, len(site.asked)) == (0, 5)
         assert "may not be resold" in outcome.err

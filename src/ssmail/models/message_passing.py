@@ -124,7 +124,7 @@ class TypedMessages(nn.Module):
         senders, receivers = edge_ends(x.shape[-2])
         z = graph[..., senders, receivers, self.skipped :]  # (..., N, N - 1, K)
         hidden = torch.relu(self.first.gathered(x))
-        hidden = hidden.view(*hidden.shape[:-1], self.types, -1)  # (..., N, N - 1, K, H)
+        hidden = hidden.view(*hidden.shape[:-1], self.types, len(self.second.weight))  # (..., N, N - 1, K, H)
         weight = self.second.weight.view(-1, *hidden.shape[-2:])  # (H, K, H)
         f = torch.einsum("...kh,okh->...ko", hidden, weight) + self.type_bias.weight.t()  # f_e^k([x_i, x_j])
         return (z.unsqueeze(-1) * f).sum(dim=(-3, -2)) / max(x.shape[-2] - 1, 1)
