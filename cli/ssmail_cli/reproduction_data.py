@@ -71,11 +71,8 @@ def tell(data: DataFiles) -> None:
 
 def settled_runs(store: "Store", sweep: Sweep) -> "dict[Cell, str]":
     """The ids of those of the cells that have been computed, whatever has become of their data."""
-    from ssmail.store import RunState
-
     rows = {cell: store.find_cell(cell.spec.hash(), cell.seed) for cell in sweep}
-    ended = (RunState.FINISHED, RunState.DIVERGED)
-    return {cell: row.id for cell, row in rows.items() if row is not None and row.state in ended}
+    return {cell: row.id for cell, row in rows.items() if row is not None and row.state.settled}
 
 
 def _absent(sweep: Sweep) -> set[tuple[str, str]]:

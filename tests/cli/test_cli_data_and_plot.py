@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.data import expert_file, letters, yjunction
+from ssmail.data import expert_sets, letters, yjunction
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance
@@ -33,7 +33,7 @@ def test_the_default_set_is_that_of_experiments_yaml(cli: CommandLine, tmp_path:
     outcome = cli("generate-yjunction", "--out", out)
     assert outcome.code == 0
     params = build_spec("ssail", "yjunction", "quick").data.yjunction
-    experts = expert_file.load(out)
+    experts = expert_sets.load(out)
     assert experts.hash == yjunction.generate(params).hash
     assert experts.hash[:16] in outcome.out
     assert f"{params.train}/{params.validation}/{params.test}" in outcome.out
@@ -54,7 +54,7 @@ def test_every_option_reaches_the_generator(cli: CommandLine, tmp_path: Path) ->
     outcome = cli("generate-yjunction", "--out", tmp_path / "set.npz", "--json", *options)
     told = json.loads(outcome.out)
     assert told["parameters"] == wanted
-    assert told["hash"] == expert_file.load(tmp_path / "set.npz").hash
+    assert told["hash"] == expert_sets.load(tmp_path / "set.npz").hash
 
 
 def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLine, tmp_path: Path) -> None:
@@ -62,12 +62,12 @@ def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLin
     assert cli("generate-letters", "--out", out).code == 0
     params = build_spec("ssail", "letters", "quick").data.letters
     assert params is not None
-    assert expert_file.load(out, "letters").hash == letters.generate(params).hash
+    assert expert_sets.load(out, "letters").hash == letters.generate(params).hash
     wanted = {"word": "NO", "train": 3, "validation": 4, "test": 5, "steps": 40, "jitter": 0.5, "seed": 7}
     options = [part for key, value in wanted.items() for part in (f"--{key}", value)]
     told = json.loads(cli("generate-letters", "--out", out, "--force", "--json", *options).out)
     assert told["parameters"] == {"environment": "letters", **wanted}  # NO is a word, though YAML reads "no" in it
-    read = expert_file.load(out, "letters")
+    read = expert_sets.load(out, "letters")
     assert told["hash"] == read.hash
     made = letters.generate(params.model_copy(update=wanted))
     assert made.hash == read.hash
@@ -90,7 +90,7 @@ def test_a_file_is_overwritten_only_with_force(cli: CommandLine, tmp_path: Path)
     assert cli(*small, "--seed", 1).sentence.startswith(f"{out} exists already")
     assert out.read_bytes() == before
     assert cli(*small, "--seed", 1, "--force").code == 0
-    assert expert_file.load(out).parameters["seed"] == 1
+    assert expert_sets.load(out).parameters["seed"] == 1
 
 
 @pytest.mark.parametrize(
@@ -145,9 +145,11 @@ def test_the_help_names_every_figure_and_statistic(cli: CommandLine) -> None:
     shown = " ".join(cli("plot", "--help").out.split())
     for module in FIGURES.values():
         assert f"{module.name} ({module.alias})" in shown
-    assert all(statistic in shown.replace("mean- ", "mean-") for statistic in Statistic)
-    having = [name for name in dict.fromkeys(module.name for module in FIGURES.values()) if FIGURES[name].has_statistic]
-    assert f"of {', '.join(having)} and training" in shown
+        own = " ".join(cli("plot", module.alias, "--help").out.split())
+        assert f"Usage: ssmail plot {module.name} " in own
+        assert ("--env" in own) == module.has_environment
+        assert ("--stat" in own) == module.has_statistic
+        assert not module.has_statistic or all(statistic in own for statistic in Statistic)
 
 
 def test_a_statistic_can_be_chosen(cli: CommandLine, db: Path, tmp_path: Path) -> None:
@@ -191,22 +193,41 @@ def test_training_curves_of_each_environment(cli: CommandLine, db: Path, tmp_pat
     assert drawn() == ["training_train-mode_mse_validation-mse"]
 
 
+def test_options_may_stand_anywhere(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    """Before, between and after the names; --stat applies to the figures that have it."""
+    out = tmp_path / "fig5"
+    line = ("--out", out, "fig4", "--format=svg", "modes", "--stat", "mean-ci", "fig4", "--db", db)
+    names = [Path(path).name for path in cli("plot", *line).out.splitlines()]
+    assert names == [f"{FIGURES[name].stem}{suffix}" for name in ("fig4", "fig5") for suffix in (".svg", ".csv")]
+    assert {path.name for path in out.iterdir()} == set(names)
+
+
+def test_a_value_may_be_called_like_a_figure(
+    cli: CommandLine, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert cli("plot", "--out", "fig5", "fig9", "--db", db).code == 0
+    assert {path.stem for path in (tmp_path / "fig5").iterdir()} == {"fig9_yjunction"}
+
+
+def test_nothing_is_drawn_before_all_options_are_parsed(cli: CommandLine, db: Path, tmp_path: Path) -> None:
+    outcome = cli("plot", "training", "fig9", "--metric", "train/mode_mse", "--out", tmp_path / "figures", "--db", db)
+    assert (outcome.code, (tmp_path / "figures").exists()) == (2, False)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ("fig4 --metric train/mode_mse", "--metric belongs to `ssmail plot training`; draw fig4 without it."),
-        ("training fig4 --group-by seed", "--group-by belongs to `ssmail plot training`; draw fig4 without it."),
-        (
-            "fig8 fig4 --env yjunction",
-            "--env belongs to `ssmail plot training` and `ssmail plot fig8`; draw fig4 without it.",
-        ),
+        ("fig4 --metric train/mode_mse", "`ssmail plot fig4` has no option --metric;"),
+        ("training fig4 --group-by seed", "`ssmail plot fig4` has no option --group-by;"),
+        ("fig8 fig4 --env yjunction", "`ssmail plot fig4` has no option --env;"),
         ("fig8 --env yjunctoin", "unknown environment 'yjunctoin'; did you mean yjunction?"),
         (
             "fig8 --env yjunction --profile quick",
             "run `ssmail ablate alpha --env yjunction --profile quick --seeds 0-4`.",
         ),
         ("fig8", "no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
-        ("fig9 --stat mean-ci", "fig9 shows no centre and band; leave --stat out."),
+        ("fig9 --stat mean-ci", "`ssmail plot fig9` has no option --stat;"),
         ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
         ("fig10", "unknown figure 'fig10'; did you mean fig"),
         ("trainin", "unknown figure 'trainin'; did you mean training?"),

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from ssmail.config.experiments import ablation, ablation_specs, as_written, build_spec, figure_requirements
+from ssmail.config.experiments import ablation, ablation_specs, build_spec, display_value, figure_requirements
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
 from ssmail.store import RunRow
@@ -23,7 +23,7 @@ def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> dict[Cell, 
     else:
         varied = ablation(needed.ablation, needed.environment)
         for value, spec in ablation_specs(varied.name, profile, environment=varied.environment).items():
-            specs.append((spec, {"method": varied.method, varied.key: as_written(value)}))
+            specs.append((spec, {"method": varied.method, varied.key: display_value(value)}))
     return {Cell(spec, seed): {**names, "seed": seed} for spec, names in specs for seed in seeds}
 
 

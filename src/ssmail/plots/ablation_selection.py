@@ -11,11 +11,11 @@ from collections.abc import Callable, Hashable, Sequence
 from datetime import datetime
 from typing import Any, NamedTuple
 
-from ssmail.config.experiments import Ablation, ablation, ablation_specs, as_written, figure_requirements, frozen
-from ssmail.config.keys import leaves
+from ssmail.config.experiments import Ablation, ablation, ablation_specs, display_value, figure_requirements, to_tuples
+from ssmail.config.spec import flatten
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns
-from ssmail.plots.selection import SETTLED, Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
+from ssmail.plots.selection import Group, Selection, newest_of_each_seed, on_one_data_set, runs_of
 from ssmail.store import RunRow, Store
 
 _ABSENT = object()
@@ -65,12 +65,12 @@ def select_ablation(
 
 def value_of(run: RunRow, key: str) -> Any:
     """The value of a dotted key in the run's spec; a mark of its own, equal to nothing else, where there is none."""
-    return frozen(dict(leaves(run.spec)).get(key, _ABSENT))
+    return to_tuples(flatten(run.spec).get(key, _ABSENT))
 
 
 def rest_of(run: RunRow, key: str) -> str:
     """The run's spec without the key, and without nulls, which earlier versions may have had no key for."""
-    values = {name: value for name, value in leaves(run.spec) if name != key and value is not None}
+    values = {name: value for name, value in flatten(run.spec).items() if name != key and value is not None}
     return json.dumps(values, sort_keys=True)
 
 
@@ -79,7 +79,7 @@ def _family(store: Store, figure: str, needed: Ablation, profile: str | None) ->
     found: dict[Hashable, list[RunRow]] = {}
     current: dict[Hashable, bool] = {}
     for run in stored:
-        if run.state in SETTLED and value_of(run, needed.key) is not _ABSENT:
+        if run.state.settled and value_of(run, needed.key) is not _ABSENT:
             found.setdefault(rest_of(run, needed.key), []).append(run)
     for rest, runs in found.items():
         current[rest] = _is_current(needed, runs[0])
@@ -103,11 +103,11 @@ def _is_current(needed: Ablation, run: RunRow) -> bool:
 
 
 def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
-    first, known = runs[0], dict(leaves(runs[0].spec))
+    first, known = runs[0], flatten(runs[0].spec)
     for run in runs:
         if value_of(run, key) is _ABSENT:
             raise InputError(f"run {run.name} ({run.method}) has no {key}, which {figure} compares; leave it out.")
-        other = dict(leaves(run.spec))
+        other = flatten(run.spec)
         differs = [name for name in known | other if name != key and known.get(name) != other.get(name)]
         if differs:
             raise InputError(
@@ -134,7 +134,7 @@ def _groups(
 
 
 def _label(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(as_written(value))
+    return f"{value:g}" if isinstance(value, float) else str(display_value(value))
 
 
 def _command(needed: Ablation, profile: str) -> str:

@@ -16,9 +16,7 @@ from typing import Any, NamedTuple
 from ssmail.config.experiments import build_spec, figure_requirements
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns
-from ssmail.store import RunRow, RunState, Store
-
-SETTLED = (RunState.FINISHED, RunState.DIVERGED)
+from ssmail.store import RunRow, Store
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,7 @@ def _by_default(store: Store, figure: str, environment: str, methods: Sequence[s
 
 
 def _candidates(stored: Sequence[RunRow]) -> list[_Candidate]:
-    settled = [run for run in stored if run.state in SETTLED]
+    settled = [run for run in stored if run.state.settled]
     return [_Candidate(runs[0].method, newest_of_each_seed(runs), _is_current(runs[0])) for runs in by_spec(settled)]
 
 
@@ -173,8 +171,8 @@ def _label(run: RunRow, alone: bool) -> str:
 def _note(chosen: _Candidate, stored: Sequence[RunRow]) -> str:
     """The spec that is drawn, and how many specs and unfinished runs are not."""
     first = chosen.runs[0]
-    others = len({run.spec_hash for run in stored if run.state in SETTLED} - {first.spec_hash})
-    unfinished = sum(run.spec_hash == first.spec_hash and run.state not in SETTLED for run in stored)
+    others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
+    unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
     seeds = ", ".join(str(run.seed) for run in chosen.runs)
     note = f"{chosen.method}: spec {first.spec_hash[:8]} (profile {first.profile}), seeds {seeds}"
     if not chosen.current:

@@ -28,7 +28,7 @@ def begin(
     newest = queries.newest_of_cell(connection, spec.hash(), seed)
     if newest is not None:
         _refuse_if_alive(newest, stale_seconds)
-        if newest.state in (RunState.FINISHED, RunState.DIVERGED) and not replace:
+        if newest.state.settled and not replace:
             raise InputError(
                 f"seed {seed} of this spec is {newest.state} already, as run {newest.name}; delete it first"
             )

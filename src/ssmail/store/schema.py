@@ -35,6 +35,11 @@ class RunState(StrEnum):
     DIVERGED = "diverged"
     INTERRUPTED = "interrupted"
 
+    @property
+    def settled(self) -> bool:
+        """Whether the run has come to its end by itself: it finished or diverged, and is not trained any further."""
+        return self in (RunState.FINISHED, RunState.DIVERGED)
+
 
 class UtcDateTime(TypeDecorator[datetime]):
     """A time in UTC: stored without a zone, read and written with one."""

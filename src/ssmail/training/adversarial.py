@@ -10,16 +10,25 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import Pairing, SelfSupervisionSpec, used
-from ssmail.losses.adversarial import Terms, gail_loss, gradient_penalty, ssail_loss, wail_loss
+from ssmail.config.sections import Pairing, SelfSupervisionSpec, required
+from ssmail.config.user_functions import load_label
+from ssmail.losses import Terms
+from ssmail.losses.adversarial import (
+    gail_loss,
+    gail_reward,
+    gradient_penalty,
+    ssail_loss,
+    ssail_reward,
+    wail_loss,
+    wail_reward,
+)
 from ssmail.losses.labels import checked_label
-from ssmail.losses.rewards import gail_reward, ssail_reward, wail_reward
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
-from ssmail.models.standards import Reach
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
@@ -52,19 +61,23 @@ class AdversarialLearner:
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
-        model, sac = used(spec.model), used(spec.sac)
+        model, sac = required(spec.model), required(spec.sac)
         self.context, self.objective = context, OBJECTIVES[spec.method]
-        self.adversarial, self.training = used(spec.adversarial), used(spec.training)
-        self.curriculum = used(spec.curriculum)
+        self.adversarial, self.training = required(spec.adversarial), required(spec.training)
+        self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
-        self.label = checked_label(self.supervision) if self.supervision else None
+        self.label = None
+        if self.supervision:
+            self.label = checked_label(self.supervision, load_label(self.supervision.label))
         self.experts, self.generators, self.device = context.experts, context.generators, context.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
         self.features = Features.of(model, self.experts.states)
         inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(inputs, action_size, model, Reach.of(model, self.features.standards)).to(self.device)
+            policy = GraphPolicy(inputs, action_size, model, ActionBounds.of(model, self.features.normalization)).to(
+                self.device
+            )
             critic = TwinCritic(inputs + action_size, model).to(self.device)
             self.discriminator = Discriminator(inputs + action_size, model.hidden).to(self.device)
         self.actor_critic = ActorCritic(

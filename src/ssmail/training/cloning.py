@@ -5,10 +5,10 @@ from collections.abc import Mapping
 import torch
 from torch import nn
 
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.models.features import Features
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
-from ssmail.models.standards import Reach
 from ssmail.training.learner import LearnerContext, Stateful
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
 from ssmail.training.rollout import PolicyPredictor
@@ -19,14 +19,16 @@ class CloningLearner:
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
-        model = used(spec.model)
-        self.context, self.cloning, self.training = context, used(spec.cloning), used(spec.training)
+        model = required(spec.model)
+        self.context, self.cloning, self.training = context, required(spec.cloning), required(spec.training)
         self.generators, self.device = context.generators, context.device
         state_size, action_size = context.experts.states.shape[-1], context.experts.actions.shape[-1]
         features = Features.of(model, context.experts.states)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(features.size(state_size), action_size, model, Reach.of(model, features.standards))
+            policy = GraphPolicy(
+                features.size(state_size), action_size, model, ActionBounds.of(model, features.normalization)
+            )
         self.policy = policy.to(self.device)
         self.predictor = PolicyPredictor(self.policy, features, context.integrator)
         self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=self.cloning.learning_rate, fused=True)

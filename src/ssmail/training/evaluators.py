@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
@@ -215,7 +215,7 @@ class ForecastEvaluator(Evaluator):
 
     def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
         super().__init__(context, data)
-        self.forecast = used(context.spec.forecast)
+        self.forecast = required(context.spec.forecast)
         self._check_windows()
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:

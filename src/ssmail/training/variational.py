@@ -11,7 +11,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import VariationalSpec, used
+from ssmail.config.sections import VariationalSpec, required
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
@@ -182,8 +182,8 @@ class VariationalLearner:
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
-        self.context, self.variational, self.cloning = context, used(spec.variational), used(spec.cloning)
-        self.curriculum, self.training = used(spec.curriculum), used(spec.training)
+        self.context, self.variational, self.cloning = context, required(spec.variational), required(spec.cloning)
+        self.curriculum, self.training = required(spec.curriculum), required(spec.training)
         self.generators, self.device = context.generators, context.device
         features = Features.of(self.variational, context.experts.states)
         state_size = context.experts.states.shape[-1]

@@ -11,7 +11,6 @@ from sqlalchemy import Connection, Table, func, insert, select
 
 from ssmail.store import arrays, schema
 from ssmail.store.connection import connect, reading, writing
-from ssmail.store.maintenance.run_contents import SETTLED
 from ssmail.store.maintenance.sqlite_file import existing, new_file, opened, require_current
 from ssmail.store.queries import RunRow
 
@@ -49,7 +48,7 @@ class Compact:
 
 def settled_cells(runs: Sequence[RunRow]) -> list[RunRow]:
     """The newest finished or diverged run of each spec, seed and data, in the given order (newest last)."""
-    newest = {(run.spec_hash, run.seed, run.dataset_hash): run for run in runs if run.state in SETTLED}
+    newest = {(run.spec_hash, run.seed, run.dataset_hash): run for run in runs if run.state.settled}
     return [run for run in runs if newest.get((run.spec_hash, run.seed, run.dataset_hash)) is run]
 
 

@@ -17,7 +17,7 @@ from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import CheckpointCopies, fault, root_of
 from ssmail.store.connection import connect, reading, writing
 from ssmail.store.lifecycle import STALE_SECONDS, is_alive
-from ssmail.store.maintenance.run_contents import SETTLED, Difference, amount, carry, first_difference
+from ssmail.store.maintenance.run_contents import Difference, amount, carry, first_difference
 from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current
 from ssmail.store.queries import RunRow
 
@@ -103,7 +103,7 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies, stale_seconds: 
             copies.stage(_wanted_folders(judge(here, there, stale_seconds), here, copies))
         with reading(theirs) as there, writing(ours) as here:
             verdicts = judge(here, there, stale_seconds)
-            copies.stage(item.run.id for item in verdicts if item.enters and item.run.state in SETTLED)
+            copies.stage(item.run.id for item in verdicts if item.enters and item.run.state.settled)
             before = {run.id for run in queries.runs(here)}
             gone = [run_id for verdict in verdicts for run_id in verdict.replaces]
             here.execute(delete(schema.run).where(schema.run.c.id.in_(gone)))
@@ -129,8 +129,8 @@ def judge(here: Connection, there: Connection, stale_seconds: float) -> list[Ver
             verdicts.append(Verdict(run, Fate.BUSY))
         elif not rivals:
             verdicts.append(Verdict(run, Fate.ADDED))
-        elif run.state in SETTLED and any(rival.state in SETTLED for rival in rivals):
-            verdicts.append(_between_settled(here, there, run, [item for item in rivals if item.state in SETTLED]))
+        elif run.state.settled and any(rival.state.settled for rival in rivals):
+            verdicts.append(_between_settled(here, there, run, [item for item in rivals if item.state.settled]))
         else:
             verdicts.append(_with_an_unfinished(here, there, run, rivals))
     return verdicts
@@ -154,9 +154,9 @@ def _between_settled(here: Connection, there: Connection, run: RunRow, rivals: S
 def _with_an_unfinished(here: Connection, there: Connection, run: RunRow, rivals: Sequence[RunRow]) -> Verdict:
     """The run or all its rivals are unfinished: the settled one stays, else the one that got further."""
     ids = tuple(rival.id for rival in rivals)
-    if run.state in SETTLED:
+    if run.state.settled:
         return Verdict(run, Fate.REPLACED, ids)
-    if any(rival.state in SETTLED for rival in rivals):
+    if any(rival.state.settled for rival in rivals):
         return Verdict(run, Fate.BEHIND)
     got, most = amount(there, run.id), max(amount(here, rival.id) for rival in rivals)
     if got > most:

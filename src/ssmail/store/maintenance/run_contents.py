@@ -8,9 +8,7 @@ from sqlalchemy import Connection, Table, func, insert, select
 
 from ssmail.store import schema
 from ssmail.store.queries import RunRow
-from ssmail.store.schema import RunState
 
-SETTLED = (RunState.FINISHED, RunState.DIVERGED)
 NOT_COMPARED = ("seconds",)
 """Metrics that tell of the machine and not of the run."""
 CHILDREN = (schema.metric, schema.metric_latest, schema.array, schema.artifact)
