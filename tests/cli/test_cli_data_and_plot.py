@@ -205,7 +205,7 @@ def test_training_curves_of_each_environment(cli: CommandLine, db: Path, tmp_pat
             "fig8 --env yjunction --profile quick",
             "run `ssmail ablate alpha --env yjunction --profile quick --seeds 0-4`.",
         ),
-        ("fig8", "no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
+        ("fig8", "no run of the ablation alpha on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
         ("fig9 --stat mean-ci", "fig9 shows no centre and band; leave --stat out."),
         ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
         ("fig10", "unknown figure 'fig10'; did you mean fig"),

@@ -24,7 +24,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.curve_numbers import slope
 from ssmail.paper.fig5_modes import shown_lanes, shown_rollouts
 from ssmail.paper.samples import Floats, Runs
-from ssmail.plots.selection import Group
+from ssmail.plots.run_groups import Group
 from ssmail.store import RunRow
 from ssmail.store.comparison import latest_values
 
