@@ -12,7 +12,7 @@ from edge_gather import GatherDynamicEncoder, GatherEmbedding, GatherMessageDeco
 from torch import nn
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import VariationalSpec, used
+from ssmail.config.sections import VariationalSpec, required
 from ssmail.losses.likelihood import variational_loss
 from ssmail.models.decoders import MessageDecoder, make_decoder
 from ssmail.models.edge_perceptron import ScaledEdges
@@ -62,7 +62,7 @@ def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, sp
 def forms_of(name: str) -> dict[str, tuple[Work, Work]]:
     """What is timed -> ssmail's form and the plain one, with the same weights."""
     (b, t, n, p), hidden, memory, decoder_name = CASES[name]
-    spec = used(build_spec("dnri", "yjunction", "quick").variational).model_copy(
+    spec = required(build_spec("dnri", "yjunction", "quick").variational).model_copy(
         update={"hidden": hidden, "memory": memory, "decoder": decoder_name, "decoder_hidden": hidden}
     )
     torch.manual_seed(0)

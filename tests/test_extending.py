@@ -1,4 +1,4 @@
-"""docs/extending.md is true: its example is a file beside an experiments.yaml, and its commands train with it."""
+"""docs/extending.md is true: its example works beside an experiments.yaml, and its commands train with it."""
 
 import re
 import shlex
@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.config.experiments import function_folders
 from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
-from ssmail.config.user_functions import UserFunction, pinned
+from ssmail.config.user_functions import UserFunction, search_folders
 from ssmail.store import Store
 from ssmail_cli.main import run
 
@@ -42,7 +41,7 @@ def test_the_example_trains_and_its_broken_brothers_do_not(home: Path, capsys: p
     commands = [shlex.split(line)[1:] for line in block("sh").splitlines()]
     assert [run(command) for command in commands] == [0, 0, 0], capsys.readouterr().err
     runs = Store.open(home.parent / "results" / "ssmail.db").runs()
-    label = pinned(UserFunction("shaping", "steep"), function_folders())
+    label = UserFunction("shaping", "steep").with_digest(search_folders())
     assert [run.spec["self_supervision"]["label"] for run in runs] == ["identity", label]  # the second has trained it
     assert {str(run.spec["self_supervision"]["alpha"]) for run in runs} == {str(DENSITY)}
     assert {run.state for run in runs} == {"finished"}

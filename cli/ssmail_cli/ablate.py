@@ -48,7 +48,7 @@ def ablate(
     A run for each value and seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops. Each
     ablation is an entry of experiments.yaml; `ssmail ablate-beta` is the same as `ssmail ablate beta`.
     """
-    from ssmail.config.experiments import ablation, ablation_specs, as_written
+    from ssmail.config.experiments import ablation, ablation_specs, display_value
     from ssmail.execution.local import Cell
 
     chosen_seeds = parse_seeds(seeds)
@@ -56,7 +56,7 @@ def ablate(
     chosen_values = None if values is None else parse_values(values)
     specs = ablation_specs(name, profile, chosen_values, settings or [], environment=environment)
     sweep = {
-        Cell(spec, seed): {column: as_written(value), "seed": seed}
+        Cell(spec, seed): {column: display_value(value), "seed": seed}
         for value, spec in specs.items()
         for seed in chosen_seeds
     }

@@ -31,7 +31,7 @@ Stat = Annotated[
 
 def check_formats(formats: Sequence[str]) -> None:
     """Raise InputError for a format that figures are not written in."""
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
     from ssmail.plots.provenance import FORMATS
 
     for form in formats:
@@ -41,7 +41,7 @@ def check_formats(formats: Sequence[str]) -> None:
 
 def parse_statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
     """The statistic of that name. Raises InputError for an unknown one, and when none of the figures shows any."""
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
     from ssmail.evaluation.statistics import Statistic
     from ssmail.paper.results import FIGURES
 

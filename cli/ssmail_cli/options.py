@@ -69,7 +69,7 @@ def select_runs(
     figure: str | None,
 ) -> "list[RunRow]":
     """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
     from ssmail.paper.results import FIGURES
     from ssmail.plots.series import needed_by
     from ssmail.store import RunState

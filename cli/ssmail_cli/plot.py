@@ -174,7 +174,7 @@ def _check_runs(names: Sequence[str], ids: Sequence[str] | None, profile: str | 
 
 def _check_figures(figures: Sequence[str]) -> None:
     """Refuse unknown names."""
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
     from ssmail.paper.results import FIGURES
 
     for name in figures:
@@ -210,7 +210,7 @@ def _chosen(
 ) -> "list[RunRow]":
     """The runs that meet every condition, newest last. Raises InputError when there is none, or an unknown name."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
 
     runs = store.runs(ids=ids, environment=environment, profile=profile)
     for method in methods or []:

@@ -126,7 +126,7 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.config.keys import unknown_name
+    from ssmail.errors import unknown_name
     from ssmail.paper.results import FIGURES
 
     listed = load_experiments().figures

@@ -207,10 +207,10 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """The same, flat: section, name, step (of a metric), value."""
-    from ssmail.config.keys import leaves
+    from ssmail.config.spec import flatten
 
     for section in ("run", "spec"):
-        for name, value in leaves(details[section]):
+        for name, value in flatten(details[section]).items():
             yield {"section": section, "name": name, "step": None, "value": value}
     for metric in details["metrics"]:
         yield {"section": "metric", **metric}

@@ -1,13 +1,28 @@
-"""The errors that ssmail raises on purpose. Each message is one sentence that names the culprit and the remedy."""
+"""Errors that ssmail raises deliberately. Each message is one sentence that names the cause and the remedy."""
+
+import difflib
+from collections.abc import Iterable
 
 
 class SsmailError(Exception):
-    """Something failed that is not the user's input (exit code 1)."""
+    """A failure that the user's input did not cause (exit code 1)."""
 
     exit_code = 1
 
 
 class InputError(SsmailError):
-    """A value, file, key or path that the user gave cannot be used (exit code 2)."""
+    """A value, file, key or path from the user cannot be used (exit code 2)."""
 
     exit_code = 2
+
+
+def suggestion(name: str, choices: Iterable[str]) -> str:
+    """The end of a message about an unknown name: the closest of `choices`, or all of them if none is close."""
+    choices = list(choices)
+    close = difflib.get_close_matches(name, choices, n=1)
+    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
+
+
+def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
+    """An InputError for a misspelt name, with a suggestion from `choices`."""
+    return InputError(f"unknown {kind} '{name}'; {suggestion(name, choices)}")

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from ssmail.config.experiments import ablation, ablation_specs, as_written, build_spec, frozen
-from ssmail.config.keys import leaves
+from ssmail.config.experiments import ablation, ablation_specs, build_spec, display_value, to_tuples
+from ssmail.config.spec import flatten
 from ssmail.errors import InputError
 
 from .experiments_file import SHIPPED, write
@@ -18,7 +18,7 @@ def test_an_ablation_varies_one_key_alone() -> None:
     specs = ablation_specs("beta", "quick")
     assert list(specs) == list(beta.values)
     assert (beta.method, beta.environment, beta.key) == ("ssail", "yjunction", "curriculum.beta")
-    flat = {value: dict(leaves(json.loads(spec.as_json()))) for value, spec in specs.items()}
+    flat = {value: flatten(json.loads(spec.as_json())) for value, spec in specs.items()}
     assert {value: spec.pop("curriculum.beta") for value, spec in flat.items()} == {value: value for value in flat}
     assert len({json.dumps(spec) for spec in flat.values()}) == 1
 
@@ -77,8 +77,8 @@ def test_an_ablation_may_be_of_another_environment(tmp_path: Path) -> None:
     ],
 )
 def test_values_are_written_as_people_do(value: Any, written: Any) -> None:
-    assert str(as_written(value)) == str(written)
-    assert frozen(written) == value
+    assert str(display_value(value)) == str(written)
+    assert to_tuples(written) == value
 
 
 def test_two_ablations_share_the_spec_that_both_hold() -> None:

@@ -194,7 +194,7 @@ def test_a_missing_default_is_named(tmp_path: Path) -> None:
     [
         ("defaults: {a: 1}\nmethods: [1,\n", r"bad\.yaml, line 3 is not valid YAML: "),
         ("defaults: {}\ndefaults: {}\n", r"bad\.yaml, line 2 is not valid YAML: 'defaults' is given twice\."),
-        ("- 1\n", r"bad\.yaml holds no mapping; it needs the sections defaults, "),
+        ("- 1\n", r"bad\.yaml contains no mapping; it needs the sections defaults, "),
         ("default: {}\n", r"unknown section 'default' in .*bad\.yaml; did you mean defaults\?"),
         ("defaults: {}\n", r"section 'environments' of .*bad\.yaml is missing or no mapping"),
         ("\x00", r"bad\.yaml is not valid YAML: "),

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from ssmail.config.experiments import ablation_specs, as_written, build_spec, figure_requirements
+from ssmail.config.experiments import ablation_specs, build_spec, display_value, figure_requirements
 from ssmail.config.experiments_file import load_experiments
 from ssmail.config.spec import ENVIRONMENTS, METHODS, RunSpec
 
@@ -42,7 +42,7 @@ def test_every_figure_names_runs_that_can_be_trained(figure: str) -> None:
 @pytest.mark.parametrize("name", EXPERIMENTS.ablations)
 def test_every_value_of_every_ablation_builds_a_spec(name: str, profile: str) -> None:
     specs = ablation_specs(name, profile)
-    assert [as_written(value) for value in specs] == EXPERIMENTS.ablations[name]["values"]
+    assert [display_value(value) for value in specs] == EXPERIMENTS.ablations[name]["values"]
     assert len({spec.hash() for spec in specs.values()}) == len(specs)
 
 

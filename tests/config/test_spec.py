@@ -19,8 +19,8 @@ from ssmail.config.spec import (
     OPTIONAL_SECTIONS,
     SECTIONS,
     RunSpec,
-    hash_of,
-    sections_of,
+    required_sections,
+    spec_hash,
 )
 from ssmail.errors import InputError
 
@@ -32,7 +32,9 @@ NO_DATA = {"path": None, "yjunction": None, "letters": None}
 def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, environment: str) -> None:
     made = build_spec(method, environment, "smoke")
     there = {name for name in OPTIONAL_SECTIONS if getattr(made, name) is not None}
-    assert there == set(sections_of(method, environment)) == {*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment]}
+    assert (
+        there == set(required_sections(method, environment)) == {*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment]}
+    )
     assert (made.forecast is not None) is (environment == "mocap")
     assert (made.data.yjunction is not None) is (environment == "yjunction")
     assert (made.data.letters is not None) is (environment == "letters")
@@ -60,7 +62,7 @@ def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict
     changes = {name: others[value] if isinstance(value, str) else value for name, value in changes.items()}
     values = {**build_spec("bc", environment, "smoke").model_dump(), **changes}
     with pytest.raises(ValidationError, match=sentence):
-        RunSpec.from_mapping(values)
+        RunSpec.model_validate(values)
 
 
 @pytest.mark.parametrize(
@@ -128,11 +130,11 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     before = json.dumps(values, sort_keys=True, separators=(",", ":"))
     assert now.hash() == hashlib.sha256(before.encode()).hexdigest()[:16]
     assert '"label":"identity"' in now.as_json()
-    assert specs.completed(values)["self_supervision"]["label"] == "identity"
+    assert specs.with_added_keys(values)["self_supervision"]["label"] == "identity"
     other = build_spec("ssail", "yjunction", "smoke", ["self_supervision.label=zero-above-one"])
     assert other.hash() != build_spec("ssail", "yjunction", "smoke").hash()
-    assert specs.completed(other.model_dump())["self_supervision"]["label"] == "zero-above-one"
-    assert specs.completed({"self_supervision": None}) == {"self_supervision": None}
+    assert specs.with_added_keys(other.model_dump())["self_supervision"]["label"] == "zero-above-one"
+    assert specs.with_added_keys({"self_supervision": None}) == {"self_supervision": None}
 
 
 @pytest.mark.parametrize(
@@ -199,8 +201,8 @@ def test_the_hash_of_stored_values_is_that_of_the_spec() -> None:
     for method, environment in (("ssail", "yjunction"), ("dnri", "mocap"), ("gail", "letters")):
         spec = build_spec(method, environment, "smoke")
         stored = json.loads(spec.as_json())
-        assert hash_of(stored) == spec.hash()
+        assert spec_hash(stored) == spec.hash()
         older = {**stored, "data": {key: value for key, value in stored["data"].items() if key != "letters"}}
-        assert (hash_of(older) == spec.hash()) is (environment != "letters")
+        assert (spec_hash(older) == spec.hash()) is (environment != "letters")
         stored["evaluation"]["samples"] += 1
-        assert hash_of(stored) != spec.hash()
+        assert spec_hash(stored) != spec.hash()

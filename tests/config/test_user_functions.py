@@ -7,9 +7,9 @@ import pytest
 
 from ssmail.config.experiments import ablation, ablation_specs, build_spec
 from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.config.spec import RunSpec
-from ssmail.config.user_functions import UserFunction, load, pinned
+from ssmail.config.user_functions import UserFunction
 from ssmail.errors import InputError
 
 from .experiments_file import write
@@ -22,12 +22,12 @@ def named(text: str) -> UserFunction:
 
 
 def loaded(text: str, *folders: Path) -> object:
-    return load(named(text), folders)(1)
+    return named(text).load(folders)(1)
 
 
 def complaint(text: str, *folders: Path) -> str:
     with pytest.raises(InputError) as caught:
-        load(named(text), folders)
+        named(text).load(folders)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -56,16 +56,16 @@ def test_a_changed_file_is_another_function_however_fast_it_changed(tmp_path: Pa
     """Python's own compiled files tell changes within a second apart by their length alone."""
     file = tmp_path / "own.py"
     file.write_text("def f(x):\n    return 1\n")
-    first = pinned(named("own:f"), [tmp_path])
+    first = named("own:f").with_digest([tmp_path])
     assert loaded(first, tmp_path) == 1
     file.write_text("def f(x):\n    return 2\n")
-    second = pinned(named("own:f"), [tmp_path])
+    second = named("own:f").with_digest([tmp_path])
     assert first != second
     assert first.startswith("own:f@")
     assert loaded(second, tmp_path) == loaded("own:f", tmp_path) == 2
-    assert "own.py is not the file it was (" in complaint(first, tmp_path)
+    assert "own.py has changed (digest " in complaint(first, tmp_path)
     file.write_bytes(b"def f(x):\r\n    return 2\r\n")
-    assert pinned(named("own:f"), [tmp_path]) == second
+    assert named("own:f").with_digest([tmp_path]) == second
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     expected = f"there is no module a.b in {tmp_path}, nor is it installed; put a/b.py beside experiments.yaml."
     assert complaint("a.b:f", tmp_path) == f"a.b:f: {expected}"
     assert "there is no module os.path.nothing in" in complaint("os.path.nothing:f", tmp_path)
-    assert complaint("math:sin", tmp_path) == "math:sin: math is no Python file; name a function of one."
+    assert complaint("math:sin", tmp_path) == "math:sin: math is not a Python file; name a function in one."
 
 
 # -- in a spec -----------------------------------------------------------------------------------------------------
@@ -113,14 +113,14 @@ def spec(label: str = "own:f") -> RunSpec:
 
 def test_a_changed_file_is_another_spec(home: Path) -> None:
     before = spec()
-    label = used(before.self_supervision).label
-    assert label == pinned(named("own:f"), [home])
+    label = required(before.self_supervision).label
+    assert label == named("own:f").with_digest([home])
     assert spec(label) == before
     assert RunSpec.model_validate_json(before.as_json()) == before
     with (home / "own.py").open("a") as file:
         file.write("# changed\n")
     assert spec().hash() != before.hash()
-    with pytest.raises(InputError, match="not the file it was"):
+    with pytest.raises(InputError, match=r"own\.py has changed"):
         spec(label)
     (home / "own.py").unlink()
     with pytest.raises(InputError, match=r"own:f: there is no module own in .*/home or .*/elsewhere, nor is it"):
@@ -132,7 +132,7 @@ def test_a_changed_file_is_another_spec(home: Path) -> None:
 def test_values_of_an_ablation_may_be_words_knots_and_functions(home: Path) -> None:
     given = ["identity", "own:f", [[0, 0], [1, 1]]]
     specs = ablation_specs("label", "smoke", given)
-    assert list(specs) == ["identity", pinned(named("own:f"), [home]), ((0.0, 0.0), (1.0, 1.0))]
+    assert list(specs) == ["identity", named("own:f").with_digest([home]), ((0.0, 0.0), (1.0, 1.0))]
     assert len({found.hash() for found in specs.values()}) == 3
     entry = {"method": "ssail", "environment": "yjunction", "key": "self_supervision.label", "values": given}
     file = write(home / "mine.yaml", ablations={"mine": entry}, profiles={"smoke": {}}, figures={})

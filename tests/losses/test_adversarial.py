@@ -7,8 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.losses.adversarial import gail_loss, gradient_penalty, wail_loss
-from ssmail.losses.rewards import gail_reward, ssail_reward, wail_reward
+from ssmail.losses.adversarial import gail_loss, gail_reward, gradient_penalty, ssail_reward, wail_loss, wail_reward
 
 
 def outputs(*values: float) -> torch.Tensor:

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
+from ssmail.config.user_functions import load_label
 from ssmail.errors import InputError
 from ssmail.losses.labels import LabelFunction, checked_label, piecewise_linear
 
@@ -19,7 +20,8 @@ finite = st.floats(-50, 50)
 
 def checked(label: str, alpha: str = "[-1,1.5]") -> LabelFunction:
     given = [f"self_supervision.label={label}", f"self_supervision.alpha={alpha}"]
-    return checked_label(used(build_spec("ssail", "yjunction", "smoke", given).self_supervision))
+    spec = required(build_spec("ssail", "yjunction", "smoke", given).self_supervision)
+    return checked_label(spec, load_label(spec.label))
 
 
 def complaint(label: str, alpha: str = "[-1,1.5]") -> str:

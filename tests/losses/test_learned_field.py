@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.losses.adversarial import ssail_loss
 from ssmail.losses.labels import checked_label, label_function
 from ssmail.losses.self_supervision import mix, sample_alpha
@@ -49,8 +49,8 @@ def mixed(alpha: Tensor) -> tuple[Tensor, Tensor]:
 @functools.cache
 def trained(label: str, density: str = "[-1,1.5]", seed: int = 0) -> Discriminator:
     given = [f"self_supervision.label={label}", f"self_supervision.alpha={density}"]
-    supervision = used(build_spec("ssail", "yjunction", "smoke", given).self_supervision)
-    function = checked_label(supervision)
+    supervision = required(build_spec("ssail", "yjunction", "smoke", given).self_supervision)
+    function = checked_label(supervision, None)
     draw = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -77,7 +77,7 @@ def field(network: Discriminator, alpha: Tensor) -> Tensor:
 def deviation(network: Discriminator, label: str, alpha: Tensor) -> Tensor:
     """(A,) the largest difference of D from the label over transitions and agents."""
     given = [f"self_supervision.label={label}"]
-    labels = label_function(used(build_spec("ssail", "yjunction", "smoke", given).self_supervision).label)(alpha)
+    labels = label_function(required(build_spec("ssail", "yjunction", "smoke", given).self_supervision).label)(alpha)
     return (field(network, alpha) - labels.view(-1, 1, 1)).abs().amax(dim=(1, 2))
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.models.features import Features
 
 
@@ -84,9 +84,9 @@ def test_the_size_is_that_of_the_features(
 
 def test_a_spec_says_what_is_read() -> None:
     yjunction, mocap = (build_spec("ssail", name, "smoke") for name in ("yjunction", "mocap"))
-    assert Features.of(used(yjunction.model), whole(2, 50, 3, 4)) == Features(time=True, start=False, steps=50)
+    assert Features.of(required(yjunction.model), whole(2, 50, 3, 4)) == Features(time=True, start=False, steps=50)
     recorded = torch.rand(4, 50, 31, 6, generator=torch.Generator().manual_seed(0))
-    features = Features.of(used(mocap.model), recorded)
+    features = Features.of(required(mocap.model), recorded)
     plain = Features(time=False, start=False, steps=50, root_relative=True, agents=31)
     assert replace(features, standards=None) == plain
     assert features.standards is not None
@@ -96,7 +96,9 @@ def test_dnri_reads_on_mocap_what_the_policy_reads() -> None:
     """Section 4.6 compares the two, so neither may have the better inputs."""
     recorded = torch.rand(4, 9, 31, 6, generator=torch.Generator().manual_seed(0))
     policy, dnri = (build_spec(method, "mocap", "quick") for method in ("ssail", "dnri"))
-    read = [Features.of(used(spec), recorded)(recorded, recorded[:, 0]) for spec in (policy.model, dnri.variational)]
+    read = [
+        Features.of(required(spec), recorded)(recorded, recorded[:, 0]) for spec in (policy.model, dnri.variational)
+    ]
     assert torch.equal(*read)
 
 
@@ -105,7 +107,7 @@ def test_standardized_training_states_have_mean_zero_and_spread_one() -> None:
     generator = torch.Generator().manual_seed(0)
     scale, shift = (10 ** torch.rand(4, 6, generator=generator), torch.rand(4, 6, generator=generator))
     experts = scale * torch.rand(20, 30, 4, 6, generator=generator) + shift
-    spec = used(build_spec("ssail", "mocap", "smoke").model)
+    spec = required(build_spec("ssail", "mocap", "smoke").model)
     features = Features.of(spec, experts)
     x, plain = (f(experts, experts[:, 0])[..., :6] for f in (features, replace(features, standards=None)))
     std, mean = torch.std_mean(x.flatten(0, 1), dim=0)
@@ -119,7 +121,7 @@ def test_standardized_training_states_have_mean_zero_and_spread_one() -> None:
 
 def test_actions_are_read_in_the_units_of_velocities_and_come_back() -> None:
     experts = torch.rand(5, 9, 3, 4, generator=torch.Generator().manual_seed(0))
-    features = Features.of(used(build_spec("ssail", "mocap", "smoke").model), experts)
+    features = Features.of(required(build_spec("ssail", "mocap", "smoke").model), experts)
     velocity = experts[..., 2:]
     torch.testing.assert_close(features.of_actions(velocity), features(experts, experts[:, 0])[..., 2:4])
     torch.testing.assert_close(features.to_actions(features.of_actions(velocity)), velocity)

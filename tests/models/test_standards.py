@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.models.actor import Actor
 from ssmail.models.standards import FARTHEST, SMALLEST, Reach, Standards
 from tests.models.test_message_passing import SPEC, one_hot_graph
@@ -59,5 +59,5 @@ def test_actions_stay_within_each_agents_own_reach(seed: int, noise: float) -> N
 
 
 def test_mocap_reads_each_joint_in_its_own_units_and_yjunction_does_not() -> None:
-    assert used(build_spec("ssail", "mocap", "quick").model).standardize
-    assert not used(build_spec("ssail", "yjunction", "quick").model).standardize
+    assert required(build_spec("ssail", "mocap", "quick").model).standardize
+    assert not required(build_spec("ssail", "yjunction", "quick").model).standardize

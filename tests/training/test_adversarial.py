@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.loop import TrainingLoop
 
@@ -47,7 +47,7 @@ def test_only_states_and_actions_are_blurred() -> None:
 def test_tau_alpha_lies_between_its_pair() -> None:
     made, loop = learner("self_supervision.alpha=[0.5,0.5]")
     generated, _ = made.generate(0.0)
-    mixed, alpha = made._mixed(generated, used(made.supervision), "start")
+    mixed, alpha = made._mixed(generated, required(made.supervision), "start")
     assert alpha.tolist() == [0.5] * len(generated)
     expert = loop.experts[generated.source]
     torch.testing.assert_close(mixed.states, (generated.states + expert.states) / 2)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
 from ssmail.models.features import Features
@@ -23,7 +23,7 @@ def drawn(*shape: int, seed: int = 0) -> Tensor:
 
 
 OBSERVED, NOISE = drawn(B, H, N, D), drawn(B, H + STEPS - 1, N, D, seed=1)
-MODEL = used(build_spec("ssail", "yjunction", "smoke").model)
+MODEL = required(build_spec("ssail", "yjunction", "smoke").model)
 PLAIN = Features(time=False, start=False, steps=50)
 
 

@@ -1,11 +1,9 @@
-"""experiments.yaml -> run specs: defaults <- environments.ENV <- methods.METHOD <- profiles.PROFILE <- overrides.
+"""Specs built from experiments.yaml: that of a run, and those of an ablation.
 
-A profile may itself hold `environments: {ENV: {...}}` and `methods: {METHOD: {...}}`, which apply after its own keys;
-an environment may hold `methods: {METHOD: {...}}`, which apply after those of the method.
-The specs of an ablation have its `settings`, and then the profile's `ablations: {NAME: {...}}`, before the overrides.
+`ssmail.config.experiments_file` lists the layers that they are merged from.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,32 +12,33 @@ import yaml
 from pydantic import ValidationError
 
 from ssmail.config import strict_yaml
-from ssmail.config.experiments_file import (
-    Experiments,
-    Layer,
-    ablation_layers,
-    file_layers,
-    find_file,
-    load_experiments,
-    merge,
-    named,
+from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
+from ssmail.config.spec import (
+    ENVIRONMENTS,
+    GENERATED,
+    METHODS,
+    OPTIONAL_SECTIONS,
+    RunSpec,
+    check_keys,
+    check_section,
+    explain,
+    flatten,
+    required_sections,
 )
-from ssmail.config.keys import check_keys, check_section, leaves, nearest, sentence
-from ssmail.config.spec import ENVIRONMENTS, GENERATED, METHODS, OPTIONAL_SECTIONS, RunSpec, sections_of
-from ssmail.config.user_functions import UserFunction, pinned
-from ssmail.errors import InputError
+from ssmail.config.user_functions import UserFunction, search_folders
+from ssmail.errors import InputError, suggestion
 
-_LABEL = ("self_supervision", "label")
+_LABEL = "self_supervision.label"
 
 
 class Ablation(NamedTuple):
-    """One method trained for several values of one key of its spec."""
+    """One method trained with several values of one key of its spec."""
 
     name: str
     method: str
     environment: str
-    key: str  # dotted, as curriculum.beta
-    values: tuple[Any, ...]  # see `frozen`
+    key: str  # dotted, such as curriculum.beta
+    values: tuple[Any, ...]  # lists are tuples (see `to_tuples`)
 
 
 class FigureRequirements(NamedTuple):
@@ -58,24 +57,24 @@ def build_spec(
     file: Path | None = None,
     source: str = "--set",
 ) -> RunSpec:
-    """Merge the layers of experiments.yaml and validate the result.
+    """Merge the layers of experiments.yaml and the overrides, and validate the result.
 
-    Each override is "key.path=value" with a YAML value; later ones win. `file` replaces the experiments.yaml that is
-    found; `source` is what a sentence calls the place of the overrides. Raises InputError, one sentence, for an unknown
-    name or key (it names the nearest), a value of the wrong type or out of range, and a file that cannot be read.
+    overrides: "key.path=value" with a YAML value; later ones win. file: another experiments.yaml than the one in use.
+    source: the place of the overrides, as messages name it. Raises InputError, one sentence, for an unknown name or key
+    (with a suggestion), a value of the wrong type or out of range, and a file that cannot be read.
     """
     experiments = load_experiments(file)
-    layers = file_layers(experiments, method, environment, profile)
+    layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
     layers += _override_layers(overrides, method, environment, source)
-    return _assemble(experiments, layers, method, environment, profile)
+    return _merge_layers(experiments, layers, method, environment, profile)
 
 
 def ablation(name: str, environment: str | None = None, file: Path | None = None) -> Ablation:
-    """The ablation `name` ("beta") of experiments.yaml, on its own environment or another one.
+    """Return the ablation `name` ("beta") of experiments.yaml, in its own environment or another one.
 
-    Raises InputError for an unknown or incomplete one, and for an environment without the section of its key.
+    Raises InputError for an unknown or incomplete ablation, and for an environment without the section of its key.
     """
-    return _ablation(load_experiments(file), name, environment)
+    return _read_ablation(load_experiments(file), name, environment)
 
 
 def ablation_specs(
@@ -86,144 +85,136 @@ def ablation_specs(
     file: Path | None = None,
     environment: str | None = None,
 ) -> dict[Any, RunSpec]:
-    """The spec for each of `values` (else the ablation's own), by the value as the spec holds it, each value once.
+    """Return the spec for each value of an ablation: for `values`, or those in the file. Equal values count once.
 
-    Layers: those of build_spec's method, environment (the ablation's own unless one is given) and profile, the
-    ablation's settings, the profile's settings for it, the overrides, the value. Raises InputError as build_spec does
-    (a wrong value is "in --values" or in the file), and for an override of the ablated key.
+    The value is the strongest layer. The keys are the values as the specs hold them. Raises InputError as build_spec
+    does (the source of a wrong value is --values or the file), and for an override of the ablation's key.
     """
     experiments = load_experiments(file)
-    return _ablation_specs(experiments, _ablation(experiments, name, environment), profile, values, overrides)
+    return _ablation_specs(experiments, _read_ablation(experiments, name, environment), profile, values, overrides)
 
 
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
     """The runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
     experiments = load_experiments(file)
-    entry = named(experiments.figures, "figure", name)
+    entry = experiments.entry("figure", name)
     source = f"figures.{name} of {experiments.path.name}"
     if "environment" not in entry or ("methods" in entry) == ("ablation" in entry):
         raise InputError(f"{source} needs an environment, and either methods or an ablation; correct it.")
     if "methods" in entry:
         return FigureRequirements(entry["environment"], tuple(entry["methods"]))
-    needed = _ablation(experiments, entry["ablation"], entry["environment"])
+    needed = _read_ablation(experiments, entry["ablation"], entry["environment"])
     return FigureRequirements(needed.environment, (needed.method,), needed.name)
 
 
 def spec_value(spec: RunSpec, key: str) -> Any:
-    """The value of a dotted key of the spec."""
+    """Return the value of a dotted key of the spec."""
     value: Any = spec
     for part in key.split("."):
         value = getattr(value, part)
     return value
 
 
-def frozen(value: Any) -> Any:
-    """A value as a spec holds it and as a dictionary may have it for a key: lists become tuples."""
-    return tuple(map(frozen, value)) if isinstance(value, list | tuple) else value
+def to_tuples(value: Any) -> Any:
+    """Return a value with its lists as tuples, as a spec holds it; it can be a key of a dictionary."""
+    return tuple(map(to_tuples, value)) if isinstance(value, list | tuple) else value
 
 
-def as_written(value: Any) -> Any:
-    """The value of a spec as people write it: (0.0, 1.0) -> [0, 1]. One that is no tuple stays as it is."""
+def display_value(value: Any) -> Any:
+    """Return a spec's tuple as a user writes it, (0.0, 1.0) -> [0, 1], and any other value unchanged."""
     if not isinstance(value, list | tuple):
         return value
-    return [int(part) if isinstance(part, float) and part.is_integer() else as_written(part) for part in value]
+    return [int(part) if isinstance(part, float) and part.is_integer() else display_value(part) for part in value]
 
 
-def function_folders(file: Path | None = None) -> tuple[Path, ...]:
-    """Where a user's own functions are looked for: the folder of the experiments.yaml in use, the current folder."""
-    return tuple(dict.fromkeys(((file or find_file()).resolve().parent, Path.cwd())))
-
-
-def _assemble(
+def _merge_layers(
     experiments: Experiments, layers: Iterable[Layer], method: str, environment: str, profile: str
 ) -> RunSpec:
-    """The spec of these layers, weakest first."""
+    """Return the spec of these layers, weakest first."""
     merged: dict[str, Any] = {}
-    origins: dict[str, str] = {}
+    sources: dict[str, str] = {}
     for layer in layers:
-        given = dict(leaves(layer.values))
+        given = flatten(layer.values)
         check_keys(given, layer.source)
-        origins.update(dict.fromkeys(given, layer.source))
+        sources |= dict.fromkeys(given, layer.source)
         merged = merge(merged, layer.values)
     if method in METHODS and environment in ENVIRONMENTS:
-        merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(sections_of(method, environment)))
+        merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(required_sections(method, environment)))
         merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED) - {environment})}
-    section, key = _LABEL
-    if isinstance(merged.get(section), Mapping) and key in merged[section]:
-        merged = merge(merged, {section: {key: _pinned(merged[section][key], experiments)}})
+    label = flatten(merged).get(_LABEL)
+    if isinstance(label, str):
+        merged = merge(merged, _nested(_LABEL, _with_digest(label, experiments)))
     try:
-        return RunSpec.from_mapping({**merged, "method": method, "environment": environment, "profile": profile})
+        return RunSpec.model_validate({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
-        raise InputError(sentence(error, origins, experiments.path)) from None
+        raise InputError(explain(error, sources, str(experiments.path))) from None
 
 
-def _pinned(label: Any, experiments: Experiments) -> Any:
-    """A label as a spec holds it: the name of a user's own function with the digest of its file, others unchanged."""
+def _with_digest(label: Any, experiments: Experiments) -> Any:
+    """Return the name of a user function with the digest of its file, and any other label unchanged."""
     function = UserFunction.parse(label)
-    return pinned(function, function_folders(experiments.path)) if function else label
+    return function.with_digest(search_folders(experiments.path)) if function else label
 
 
-def _ablation(experiments: Experiments, name: str, environment: str | None = None) -> Ablation:
-    entry = named(experiments.ablations, "ablation", name)
+def _read_ablation(experiments: Experiments, name: str, environment: str | None) -> Ablation:
+    entry = experiments.entry("ablation", name)
     source = f"ablations.{name} of {experiments.path.name}"
-    choices = (*Ablation._fields[1:], "settings")
+    needed = Ablation._fields[1:]
     for key in entry:
-        if key not in choices:
-            raise InputError(f"unknown key '{key}' in {source}; {nearest(str(key), choices)}")
-    for key in Ablation._fields[1:]:
+        if key not in (*needed, "settings"):
+            raise InputError(f"unknown key '{key}' in {source}; {suggestion(str(key), (*needed, 'settings'))}")
+    for key in needed:
         if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
             raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
-    where = environment or entry["environment"]
-    named(experiments.environments, "environment", where)
-    check_section(entry["key"], entry["method"], where, source)
+    environment = environment or entry["environment"]
+    experiments.entry("environment", environment)
+    check_section(entry["key"], entry["method"], environment, source)
     values = entry["values"]
-    if entry["key"] == ".".join(_LABEL):
-        with suppress(InputError):  # runs can be drawn without the files of their functions
-            values = [_pinned(value, experiments) for value in values]
-    return Ablation(name, entry["method"], where, entry["key"], frozen(values))
+    if entry["key"] == _LABEL:
+        with suppress(InputError):  # stored runs can be drawn without the files of their functions
+            values = [_with_digest(value, experiments) for value in values]
+    return Ablation(name, entry["method"], environment, entry["key"], to_tuples(values))
 
 
 def _ablation_specs(
-    experiments: Experiments, found: Ablation, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
+    experiments: Experiments, chosen: Ablation, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
 ) -> dict[Any, RunSpec]:
-    layers = file_layers(experiments, found.method, found.environment, profile)
-    layers += ablation_layers(experiments, found.name, profile)
-    given = _override_layers(overrides, found.method, found.environment, "--set")
-    if any(found.key in dict(leaves(layer.values)) for layer in given):
-        what = f"{found.key} is what the ablation {found.name} varies"
-        raise InputError(f"{what}; give its values with --values, not --set.")
-    source = f"ablations.{found.name} of {experiments.path.name}" if values is None else "--values"
+    name, method, environment, key, own_values = chosen
+    layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
+    layers += experiments.layers(ABLATION_LAYERS, ablation=name, profile=profile)
+    override_layers = _override_layers(overrides, method, environment, "--set")
+    if any(key in flatten(layer.values) for layer in override_layers):
+        raise InputError(f"{key} is what the ablation {name} varies; give its values with --values, not --set.")
+    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
     specs: dict[Any, RunSpec] = {}
-    for value in found.values if values is None else values:
-        varied = Layer(source, _nested(found.key, value))
-        spec = _assemble(experiments, [*layers, *given, varied], found.method, found.environment, profile)
-        specs[spec_value(spec, found.key)] = spec
+    for value in own_values if values is None else values:
+        varied = Layer(source, _nested(key, value))
+        spec = _merge_layers(experiments, [*layers, *override_layers, varied], method, environment, profile)
+        specs[spec_value(spec, key)] = spec
     return specs
 
 
 def _override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[Layer]:
-    """A layer for each override."""
-    layers = [Layer(source, _parse_override(text)) for text in overrides]
+    """Return a layer for each "key.path=value"."""
+    layers = []
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        key = key.strip()
+        if not equals or not all(key.split(".")):
+            raise InputError(f"--set takes key.path=value, not '{text}'; for example --set sac.gamma=0.9.")
+        try:
+            layers.append(Layer(source, _nested(key, strict_yaml.parse(value))))
+        except yaml.YAMLError:
+            raise InputError(f"the value of --set {text} is not valid YAML; put quotes around text.") from None
     for layer in layers:
-        for key, _ in leaves(layer.values):
+        for key in flatten(layer.values):
             check_section(key, method, environment, source)
     return layers
 
 
-def _parse_override(text: str) -> dict[str, Any]:
-    """ "a.b=0.5" -> {"a": {"b": 0.5}}."""
-    key, equals, value = text.partition("=")
-    key = key.strip()
-    if not equals or not all(key.split(".")):
-        raise InputError(f"--set takes key.path=value, not '{text}'; for example --set sac.gamma=0.9.")
-    try:
-        parsed = strict_yaml.parse(value)
-    except yaml.YAMLError:
-        raise InputError(f"the value of --set {text} is not valid YAML; put quotes around text.") from None
-    return _nested(key, parsed)
-
-
 def _nested(key: str, value: Any) -> dict[str, Any]:
-    """("a.b", 0.5) -> {"a": {"b": 0.5}}."""
-    first, _, rest = key.partition(".")
-    return {first: _nested(rest, value) if rest else value}
+    """Return a dotted key as nested mappings: ("a.b", 0.5) -> {"a": {"b": 0.5}}."""
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    nested: dict[str, Any] = value
+    return nested

@@ -29,8 +29,8 @@ class Frozen(BaseModel):
 Section = TypeVar("Section", bound=Frozen)
 
 
-def used(section: Section | None) -> Section:
-    """A section that the method has by SECTIONS, for those who know that it does."""
+def required(section: Section | None) -> Section:
+    """Return a section that the method requires (spec.SECTIONS), for callers that serve no other methods."""
     assert section is not None
     return section
 

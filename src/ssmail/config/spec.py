@@ -1,12 +1,19 @@
-"""What a run is: a frozen, validated, hashable description of everything but its seed. Its parts: spec_sections."""
+"""RunSpec: a frozen, validated and hashable description of a run, and the checks of its keys.
 
+Its sections are in `ssmail.config.sections`. A spec defines everything about a run except its seed.
+"""
+
+import difflib
 import hashlib
 import json
+import re
 from collections.abc import Mapping
+from itertools import chain
 from typing import Any, Literal, Self, get_args
 
-from pydantic import model_validator
+from pydantic import BaseModel, ValidationError, model_validator
 
+from ssmail.config import strict_yaml
 from ssmail.config.sections import (
     AdversarialSpec,
     CloningSpec,
@@ -22,30 +29,45 @@ from ssmail.config.sections import (
     VariationalSpec,
     WassersteinSpec,
 )
+from ssmail.errors import InputError
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
 METHODS: tuple[str, ...] = get_args(Method)
 Environment = Literal["yjunction", "letters", "mocap"]
 ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 
-_GAME = ("model", "adversarial", "sac", "curriculum", "training")
+_ADVERSARIAL = ("model", "adversarial", "sac", "curriculum", "training")
 _VARIATIONAL = ("variational", "cloning", "curriculum", "training")
+# The optional sections that each method and each environment requires. All others are null in its spec.
 SECTIONS: dict[str, tuple[str, ...]] = {
-    "ssail": (*_GAME, "self_supervision"),
-    "gail": _GAME,
-    "wail": (*_GAME, "wasserstein"),
+    "ssail": (*_ADVERSARIAL, "self_supervision"),
+    "gail": _ADVERSARIAL,
+    "wail": (*_ADVERSARIAL, "wasserstein"),
     "bc": ("model", "cloning", "training"),
     "nri": _VARIATIONAL,
     "dnri": _VARIATIONAL,
     "constant-velocity": (),
     "copy-last": (),
-}  # the sections that a method has beside data and evaluation; the others are null in its spec
-ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "letters": (), "mocap": ("forecast",)}  # likewise
-GENERATED = ("yjunction", "letters")  # environments with a generator, whose parameters are data.ENVIRONMENT
+}
+ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "letters": (), "mocap": ("forecast",)}
+OPTIONAL_SECTIONS = tuple(dict.fromkeys(chain(*SECTIONS.values(), *ENVIRONMENT_SECTIONS.values())))
+GENERATED = ("yjunction", "letters")  # environments with a data generator, configured by data.ENVIRONMENT
+
+# (section, key, value) of keys that were added after runs had been stored. Earlier runs behaved as the value says, so
+# it is left out of the hash.
+ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
+    ("self_supervision", "label", "identity"),
+    ("data", "letters", None),
+    ("model", "initial_scale", 0.1),
+    ("model", "standardize", False),
+    ("sac", "encoder_steps", None),
+    *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
+)
+_ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
 
 
 class RunSpec(Frozen):
-    """Everything that defines a run but its seed. A section that the method does not use is null (see SECTIONS)."""
+    """Everything that defines a run except its seed. Sections that the method does not use are null (see SECTIONS)."""
 
     method: Method
     environment: Environment
@@ -64,66 +86,146 @@ class RunSpec(Frozen):
     forecast: ForecastSpec | None
 
     @model_validator(mode="after")
-    def _has_its_sections(self) -> Self:
+    def _check_sections(self) -> Self:
         for name in OPTIONAL_SECTIONS:
-            needed, given = name in sections_of(self.method, self.environment), getattr(self, name) is not None
-            if needed != given:
-                what = f"{self.method} on {self.environment}"
-                raise ValueError(f"{what} {_needs(needed)} section {name}")
+            needed = name in required_sections(self.method, self.environment)
+            if needed != (getattr(self, name) is not None):
+                verb = "needs" if needed else "has no"
+                raise ValueError(f"{self.method} on {self.environment} {verb} section {name}")
         for name in GENERATED:
-            if (getattr(self.data, name) is not None) != (name == self.environment):
-                raise ValueError(f"environment {self.environment} {_needs(name == self.environment)} data.{name}")
+            needed = name == self.environment
+            if needed != (getattr(self.data, name) is not None):
+                raise ValueError(f"environment {self.environment} {'needs' if needed else 'has no'} data.{name}")
         if self.environment not in GENERATED and self.data.path is None:
             raise ValueError(f"environment {self.environment} needs a data file; set data.path")
         return self
 
     @property
     def epochs(self) -> int:
-        """Training epochs; 0 for a reference that needs no training."""
+        """The number of training epochs; 0 for a baseline that is not trained."""
         return self.training.epochs if self.training else 0
 
     def as_json(self) -> str:
-        """Canonical JSON: sorted keys, no spaces; equal specs give equal text."""
+        """Return canonical JSON (sorted keys, no spaces): equal specs have equal text."""
         return _canonical(self.model_dump(mode="json"))
 
     def hash(self) -> str:
-        """First 16 hexadecimal digits of the SHA-256 of the canonical JSON without nulls; names a cell together with
-        the seed. A section that is added for other methods thus leaves the hash as it was, and so does a key of LATER
-        with the value that earlier runs had.
-        """
-        return hash_of(self.model_dump(mode="json"))
-
-    @classmethod
-    def from_mapping(cls, values: dict[str, Any]) -> Self:
-        """Validate plain nested values. Raises pydantic.ValidationError, for ssmail.config.experiments to explain."""
-        return cls.model_validate(values)
+        """Return the hash that identifies a cell together with the seed (see `spec_hash`)."""
+        return spec_hash(self.model_dump(mode="json"))
 
 
-def sections_of(method: str, environment: str) -> tuple[str, ...]:
-    """The sections of a spec that are not null, beside data and evaluation."""
+def required_sections(method: str, environment: str) -> tuple[str, ...]:
+    """Return the optional sections that a spec of this method and environment must have."""
     return (*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
 
 
-def hash_of(stored: Mapping[str, Any]) -> str:
-    """RunSpec.hash of a spec's nested values, as they are stored as JSON; of an earlier version's too."""
+def spec_hash(stored: Mapping[str, Any]) -> str:
+    """Return the first 16 hexadecimal digits of the SHA-256 of a spec's canonical JSON.
+
+    Nulls and ADDED_KEYS with their value are left out. So the hash stays the same when a later version adds a section
+    that other methods use, or a key whose null or listed value means what earlier versions did.
+    """
     values = _without_nulls(stored)
-    for section, key, before in LATER:
+    for section, key, before in ADDED_KEYS:
         if section in values and values[section].get(key) == before:
             values[section].pop(key, None)
     return hashlib.sha256(_canonical(values).encode()).hexdigest()[:16]
 
 
-def completed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The nested values of a stored spec, with the keys of LATER that it is too old to have."""
-    whole = dict(values)
-    for section, key, before in LATER:
-        if whole.get(section) is not None:
-            whole[section] = {key: before, **whole[section]}
-    return whole
+def with_added_keys(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the nested values of a stored spec, with the ADDED_KEYS that it is too old to have."""
+    values = dict(stored)
+    for section, key, before in ADDED_KEYS:
+        if values.get(section) is not None:
+            values[section] = {key: before, **values[section]}
+    return values
 
 
-def _needs(needed: bool) -> str:
-    return "needs" if needed else "has no"
+def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested values by dotted key: {"a": {"b": 1}} -> {"a.b": 1}. An empty mapping counts as a value."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        nested = isinstance(value, Mapping) and value
+        flat |= flatten(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
+    return flat
+
+
+def check_keys(given: Mapping[str, Any], source: str) -> None:
+    """Raise InputError if a dotted key of `given` is unknown, cannot be set, or is a section with a plain value.
+
+    source: the place of the keys, as messages name it.
+    """
+    sections = _spec_keys(RunSpec)
+    for key, value in given.items():
+        if key in _ARGUMENTS:
+            raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
+        if key not in sections:
+            raise InputError(f"unknown key '{key}' in {source}; {_suggest_key(key, sections)}")
+        if sections[key] and not isinstance(value, Mapping):
+            first = next(other for other in sections if other.startswith(f"{key}."))
+            what = f"{key} = {strict_yaml.inline(value)} in {source}"
+            raise InputError(f"{what} is a section, not a value; set one of its keys such as {first}.")
+
+
+def check_section(key: str, method: str, environment: str, source: str) -> None:
+    """Raise InputError if a dotted key is in a section that the method or environment does not have.
+
+    Unknown methods and environments are not checked.
+    """
+    if method not in METHODS or environment not in ENVIRONMENTS:
+        return
+    for other in GENERATED:
+        if other != environment and f"{key}.".startswith(f"data.{other}."):
+            raise InputError(f"environment {environment} has no section 'data.{other}' to set in {source}.")
+    section = key.partition(".")[0]
+    if section in OPTIONAL_SECTIONS and section not in required_sections(method, environment):
+        tables = {**SECTIONS, **ENVIRONMENT_SECTIONS}
+        users = ", ".join(name for name, sections in tables.items() if section in sections)
+        what = f"method {method} on {environment}"
+        raise InputError(f"{what} has no section '{section}' to set in {source}; it belongs to {users}.")
+
+
+def explain(error: ValidationError, sources: Mapping[str, str], file: str) -> str:
+    """Return one sentence about the first problem of a validation: the key, its value and source, what is expected.
+
+    sources: the place where each dotted key was set. file: the name of the file that should hold all defaults.
+    """
+    first = error.errors(include_url=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "missing":
+        return f"{file} gives no value for {key}; add it under defaults."
+    if first["type"] == "value_error":
+        return f"{key}: {first['msg'].removeprefix('Value error, ')}."
+    expected = re.sub(r"^Input should be (a valid )?", "", first["msg"])
+    kinds = {"integer": "a whole number", "number": "a number", "boolean": "true or false", "string": "text"}
+    source = f" in {sources[key]}" if key in sources else ""
+    return f"{key} = {strict_yaml.inline(first['input'])}{source} should be {kinds.get(expected, expected)}."
+
+
+def _spec_keys(model: type[BaseModel], prefix: str = "") -> dict[str, bool]:
+    """Return whether each dotted key that can be set is a section."""
+    keys: dict[str, bool] = {}
+    for name, field in model.model_fields.items():
+        kinds = get_args(field.annotation) or (field.annotation,)  # of `Section`, or of `Section | None`
+        section = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
+        if prefix or name not in _ARGUMENTS:
+            keys[f"{prefix}{name}"] = section is not None
+        keys |= _spec_keys(section, f"{prefix}{name}.") if section else {}
+    return keys
+
+
+def _suggest_key(key: str, sections: Mapping[str, bool]) -> str:
+    """Suggest a close key of the same section, a key with the same last part, any close key, or all keys."""
+    values = [name for name, is_section in sections.items() if not is_section]
+    section, _, last = key.rpartition(".")
+    siblings = {name.rpartition(".")[2]: name for name in sections if name.rpartition(".")[0] == section}
+    close = [siblings[name] for name in difflib.get_close_matches(last, siblings, n=1)]
+    close = close or [name for name in values if name.rpartition(".")[2] == last]
+    close = close or ([] if siblings else difflib.get_close_matches(key, values, n=1))
+    if close:
+        return f"did you mean {close[0]}?"
+    choices = siblings.values() or [name for name in sections if "." not in name]
+    return f"choose from {', '.join(choices)}."
 
 
 def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -136,20 +238,3 @@ def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:
 
 def _canonical(values: Any) -> str:
     return json.dumps(values, sort_keys=True, separators=(",", ":"))
-
-
-LATER: tuple[tuple[str, str, Any], ...] = (
-    ("self_supervision", "label", "identity"),
-    ("data", "letters", None),
-    ("model", "initial_scale", 0.1),
-    ("model", "standardize", False),
-    ("sac", "encoder_steps", None),
-    *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
-)
-"""(section, key, value) of what runs of earlier versions had without a name for it."""
-
-OPTIONAL_SECTIONS = tuple(
-    dict.fromkeys(
-        name for table in (SECTIONS, ENVIRONMENT_SECTIONS) for sections in table.values() for name in sections
-    )
-)

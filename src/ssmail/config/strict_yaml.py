@@ -1,4 +1,4 @@
-"""YAML with the surprises taken out: 1e-3 is a number (PyYAML: text), a key given twice an error (PyYAML: the last)."""
+"""YAML without surprises: 1e-3 is a number (text in PyYAML), a repeated key an error (PyYAML takes the last one)."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ from ssmail.errors import InputError
 
 
 def read(path: Path) -> Any:
-    """The content of a file. Raises InputError, naming file and line, when it cannot be read or is not valid YAML."""
+    """Return the content of a file. Raises InputError with file and line if it cannot be read or is not valid YAML."""
     try:
         return parse(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -21,16 +21,16 @@ def read(path: Path) -> Any:
         line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
         raise InputError(f"{path}{line} is not valid YAML: {error.problem}.") from None
     except yaml.YAMLError:
-        raise InputError(f"{path} is not valid YAML: it holds a character that is not allowed.") from None
+        raise InputError(f"{path} is not valid YAML: it contains a character that is not allowed.") from None
 
 
 def parse(text: str) -> Any:
-    """The value that the text stands for. Raises yaml.YAMLError."""
+    """Return the value of a YAML text. Raises yaml.YAMLError."""
     return yaml.load(text, _Loader)
 
 
-def shown(value: Any) -> str:
-    """A value as YAML writes it on one line."""
+def inline(value: Any) -> str:
+    """Return a value as YAML on one line."""
     return str(yaml.safe_dump(value, default_flow_style=True, width=10**6)).removesuffix("\n").removesuffix("\n...")
 
 

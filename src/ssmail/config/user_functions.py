@@ -1,27 +1,30 @@
-"""A user's own Python function, named in a spec as "module:function": where its file is, what it is known by, and how
-it is loaded.
+"""Python functions of the user, named in a spec as "module:function": how they are found, identified and loaded.
 
-The file is looked for in the given folders, then among the installed packages. A spec that is built from
-experiments.yaml holds the first digits of the SHA-256 of that file behind the name, "module:function@digest": a run is
-of the function as it was. What the file itself imports is not in the digest.
+A module is searched for next to the experiments.yaml in use, in the current folder, and among the installed packages.
+A spec that is built from experiments.yaml holds "module:function@digest", with the first 12 digits of the SHA-256 of
+the module's file: a run belongs to the function as it was. The digest does not cover what that file imports.
 """
 
 import hashlib
 import importlib.util
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
-from ssmail.config.keys import nearest
+from ssmail.config.experiments_file import find_file
 from ssmail.config.shaping import FUNCTION
-from ssmail.errors import InputError
+from ssmail.errors import InputError, suggestion
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass(frozen=True)
 class UserFunction:
-    """The parts of "package.module:function@digest"; digest None: whatever the file holds now."""
+    """The parts of "package.module:function@digest". Without a digest, any content of the file is accepted."""
 
     module: str
     name: str
@@ -29,103 +32,144 @@ class UserFunction:
 
     @classmethod
     def parse(cls, text: Any) -> Self | None:
-        """The parts of a text of this form; None for anything else."""
+        """Return the parts of a text of this form, None for anything else."""
         found = FUNCTION.fullmatch(text) if isinstance(text, str) else None
         return cls(found["module"], found["name"], found["digest"]) if found else None
 
     def __str__(self) -> str:
-        """As the user writes it."""
+        """Return the name without the digest, as the user writes it."""
         return f"{self.module}:{self.name}"
 
+    def with_digest(self, folders: Sequence[Path]) -> str:
+        """Return "module:function@digest" for the current content of the file.
 
-def pinned(function: UserFunction, folders: Sequence[Path]) -> str:
-    """ "module:function@digest" of its file as it is now.
+        Raises InputError if there is no such file, or if this function has a digest and the file another one.
+        """
+        return f"{self}@{_digest(self._read(self._locate(folders)))}"
 
-    Raises InputError when there is no such file, and when the function has a digest and the file another one.
+    def load(self, folders: Sequence[Path]) -> Callable[..., Any]:
+        """Execute the file and return its function. Nothing is cached.
+
+        While the file is executed, its own imports also find modules in `folders`, after everything else. Raises
+        InputError as `with_digest` does, if the file cannot be executed, and if it does not define the function.
+        """
+        path = self._locate(folders)
+        module = self._execute(path, self._read(path), folders)
+        function = getattr(module, self.name, None)
+        if not callable(function):
+            names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
+            remedy = suggestion(self.name, names) if names else "define it there."
+            raise InputError(f"{self}: {path} has no function {self.name}; {remedy}")
+        found: Callable[..., Any] = function
+        return found
+
+    def _locate(self, folders: Sequence[Path]) -> Path:
+        inside = Path(*self.module.split("."))
+        for folder in folders:
+            for path in (folder / inside.with_suffix(".py"), folder / inside / "__init__.py"):
+                if path.is_file():
+                    return path
+        try:
+            spec = importlib.util.find_spec(self.module)
+        except Exception:  # a parent package that cannot be imported, or is not a package
+            spec = None
+        if spec is None:
+            where = " or ".join(dict.fromkeys(map(str, folders)))
+            raise InputError(
+                f"{self}: there is no module {self.module} in {where}, nor is it installed; "
+                f"put {inside.with_suffix('.py')} beside experiments.yaml."
+            )
+        if not spec.has_location or not str(spec.origin).endswith(".py"):
+            raise InputError(f"{self}: {self.module} is not a Python file; name a function in one.")
+        return Path(str(spec.origin))
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            source = path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{self}: {path} cannot be read: {error.strerror}.") from None
+        if self.digest not in (None, _digest(source)):
+            raise InputError(
+                f"{self}: {path} has changed (digest {self.digest} then, {_digest(source)} now); "
+                "restore it, or repeat the command without the @ and what follows it."
+            )
+        return source
+
+    def _execute(self, path: Path, source: bytes, folders: Sequence[Path]) -> Any:
+        """Return a new module made from `source`, which the digest covers; a compiled file of Python's may be older."""
+        search = [str(path.parent)] if path.name == "__init__.py" else None
+        spec = importlib.util.spec_from_file_location(self.module, path, submodule_search_locations=search)
+        assert spec is not None
+        module = importlib.util.module_from_spec(spec)
+        before, paths = sys.modules.get(self.module), list(sys.path)
+        sys.modules[self.module] = module  # where dataclasses and relative imports look
+        sys.path += map(str, folders)
+        try:
+            exec(compile(source, str(path), "exec"), vars(module))
+        except (Exception, SystemExit) as error:
+            raise InputError(f"{self}: {path} cannot be imported, {_one_line(error)}; correct it.") from error
+        finally:
+            sys.path[:] = paths
+            sys.modules.pop(self.module, None)
+            if before is not None:
+                sys.modules[self.module] = before
+        return module
+
+
+def search_folders(file: Path | None = None) -> tuple[Path, ...]:
+    """Return where user functions are searched for: the folder of the experiments.yaml in use, the current folder."""
+    return tuple(dict.fromkeys(((file or find_file()).resolve().parent, Path.cwd())))
+
+
+def load_label(label: Any) -> "Callable[[Tensor], Tensor] | None":
+    """Load the user's label function that `self_supervision.label` names; None if the label is built in or knots.
+
+    The function gets a copy of the alphas (B,) on the CPU. Every call raises InputError, one sentence that names the
+    function, unless it returns a tensor of finite labels (B,).
     """
-    path = _locate(function, folders)
-    return f"{function}@{_digest(_read(function, path))}"
+    user_function = UserFunction.parse(label)
+    if user_function is None:
+        return None
+    import torch  # not at the top: a plan must not wait for torch
 
-
-def load(function: UserFunction, folders: Sequence[Path]) -> Callable[..., Any]:
-    """Execute the file, afresh each time, and return what it calls `name`.
-
-    While it is executed its own imports find the folders too, after everything else. Raises InputError as `pinned`
-    does, when the file cannot be executed, and when it has no function of that name.
-    """
-    path = _locate(function, folders)
-    source = _read(function, path)
-    module = _execute(function, path, source, folders)
-    found = getattr(module, function.name, None)
-    if not callable(found):
-        names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
-        remedy = nearest(function.name, names) if names else "define it there."
-        raise InputError(f"{function}: {path} has no function {function.name}; {remedy}")
-    made: Callable[..., Any] = found
-    return made
-
-
-def _locate(function: UserFunction, folders: Sequence[Path]) -> Path:
-    inside = Path(*function.module.split("."))
-    for folder in folders:
-        for path in (folder / inside.with_suffix(".py"), folder / inside / "__init__.py"):
-            if path.is_file():
-                return path
+    function = user_function.load(search_folders())
+    name = f"self_supervision.label: the function {user_function}"
     try:
-        spec = importlib.util.find_spec(function.module)
-    except Exception:  # of a parent package that cannot be imported, or is none
-        spec = None
-    if spec is None:
-        where = " or ".join(dict.fromkeys(map(str, folders)))
-        raise InputError(
-            f"{function}: there is no module {function.module} in {where}, nor is it installed; "
-            f"put {inside.with_suffix('.py')} beside experiments.yaml."
-        )
-    if not spec.has_location or not str(spec.origin).endswith(".py"):
-        raise InputError(f"{function}: {function.module} is no Python file; name a function of one.")
-    return Path(str(spec.origin))
+        inspect.signature(function).bind(None)
+    except TypeError as error:
+        problem = f"cannot be called with one tensor of alphas ({_one_line(error)})"
+        raise InputError(f"{name} {problem}; let it take that.") from None
+    except ValueError:  # it has no signature to inspect
+        pass
 
+    def label_function(alpha: "Tensor") -> "Tensor":
+        with torch.no_grad():
+            try:
+                labels = function(alpha.detach().cpu().clone())
+            except Exception as error:
+                problem = f"raises {_one_line(error)}, given {len(alpha)} alphas"
+                raise InputError(f"{name} {problem}; correct it.") from error
+        if not isinstance(labels, torch.Tensor):
+            problem = f"returns {type(labels).__name__}, not a tensor"
+            raise InputError(f"{name} {problem}; return a label for each of its alphas.")
+        if labels.shape != alpha.shape:
+            problem = f"returns labels of shape {tuple(labels.shape)} for alphas of shape {tuple(alpha.shape)}"
+            raise InputError(f"{name} {problem}; return a label for each of them.")
+        labels = labels.detach().to(alpha)
+        wrong = alpha[~labels.isfinite()]
+        if len(wrong):
+            problem = f"returns NaN or infinity for alpha {float(wrong[0]):.4g}"
+            raise InputError(f"{name} {problem}; return finite labels.")
+        return labels
 
-def _read(function: UserFunction, path: Path) -> bytes:
-    """The file's content, whose digest is that of the function if it has one."""
-    try:
-        source = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{function}: {path} cannot be read: {error.strerror}.") from None
-    if function.digest not in (None, _digest(source)):
-        raise InputError(
-            f"{function}: {path} is not the file it was ({function.digest} then, {_digest(source)} now); "
-            "restore it, or give the command again without what stands behind the @."
-        )
-    return source
+    return label_function
 
 
 def _digest(source: bytes) -> str:
-    """The same on a system that ends lines in another way."""
+    """Return the digest of a file. It does not depend on how the system ends lines."""
     return hashlib.sha256(source.replace(b"\r\n", b"\n")).hexdigest()[:12]
 
 
-def _execute(function: UserFunction, path: Path, source: bytes, folders: Sequence[Path]) -> Any:
-    """A new module of this source, which is what the digest is of; a compiled file of Python's could be another."""
-    search = [str(path.parent)] if path.name == "__init__.py" else None
-    spec = importlib.util.spec_from_file_location(function.module, path, submodule_search_locations=search)
-    assert spec is not None
-    module = importlib.util.module_from_spec(spec)
-    before, paths = sys.modules.get(function.module), list(sys.path)
-    sys.modules[function.module] = module  # dataclasses and relative imports look there
-    sys.path += map(str, folders)
-    try:
-        exec(compile(source, str(path), "exec"), vars(module))
-    except (Exception, SystemExit) as error:
-        raise InputError(f"{function}: {path} cannot be imported, {told(error)}; correct it.") from error
-    finally:
-        sys.path[:] = paths
-        sys.modules.pop(function.module, None)
-        if before is not None:
-            sys.modules[function.module] = before
-    return module
-
-
-def told(error: BaseException) -> str:
-    """An exception on one line, without a full stop."""
+def _one_line(error: BaseException) -> str:
+    """Return an exception as one line without a full stop."""
     return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(".: ")

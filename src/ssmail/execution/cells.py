@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from ssmail.config.spec import RunSpec
+from ssmail.config.user_functions import load_label
 from ssmail.data.expert_file import load
 from ssmail.errors import InputError
 from ssmail.store import HEARTBEAT_SECONDS, STALE_SECONDS, RunRow, RunState, Store, is_alive
@@ -102,7 +103,7 @@ class Job:
         """The inverse of `as_line`."""
         parts = json.loads(line)
         settings = Settings(**{**parts["settings"], "resume": Resume(parts["settings"]["resume"])})
-        return cls(Cell(RunSpec.from_mapping(parts["spec"]), parts["seed"]), parts["store_url"], settings)
+        return cls(Cell(RunSpec.model_validate(parts["spec"]), parts["seed"]), parts["store_url"], settings)
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,9 @@ def check_labels(cells: Iterable[Cell]) -> None:
     """Raise InputError when the label function of any of the cells is broken, before one of them is computed."""
     for supervision in dict.fromkeys(cell.spec.self_supervision for cell in cells):
         if supervision is not None and supervision.label != "identity":
-            from ssmail.losses.labels import checked_label  # imported here because a plan must not wait for torch
+            from ssmail.losses.labels import checked_label  # not at the top: a plan must not wait for torch
 
-            checked_label(supervision)
+            checked_label(supervision, load_label(supervision.label))
 
 
 def _check_data(cell: Cell, row: RunRow) -> None:

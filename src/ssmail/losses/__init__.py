@@ -1,1 +1,5 @@
-"""Losses: pure functions from tensors to a scalar and its terms."""
+"""Loss functions: pure functions of tensors. Most return the scalar to minimize and its terms by name."""
+
+from torch import Tensor
+
+Terms = dict[str, Tensor]

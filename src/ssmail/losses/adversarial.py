@@ -1,6 +1,7 @@
-"""Losses of the discriminator. Each takes its outputs and returns the scalar to minimise and its terms.
+"""Discriminator losses and rewards of ssail, gail and wail.
 
-Everywhere 0 = generated and 1 = expert, and a higher output means "more like the expert". Outputs are (B, T, N).
+Everywhere 0 = generated and 1 = expert: a higher output D means "more like the expert" and is a higher reward. Outputs
+are (B, T, N); the losses are scalars to minimize.
 """
 
 from collections.abc import Callable
@@ -8,27 +9,30 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-Terms = dict[str, Tensor]
+from ssmail.losses import Terms
 
 
 def ssail_loss(generated: Tensor, expert: Tensor, mixed: Tensor, labels: Tensor) -> tuple[Tensor, Terms]:
-    """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (label(alpha) - D(tau_alpha))^2, each a mean over trajectories,
-    steps and agents. The paper's label is alpha itself, or that of A.2 (`ssmail.losses.labels`).
+    """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (label(alpha) - D(tau_alpha))^2, each averaged over B, T and N.
 
-    generated, expert, mixed: (B, T, N) outputs of D; labels: (B,) those of the mixed trajectories.
+    labels: (B,) targets for the mixed trajectories: alpha itself in the paper, or that of A.2 (`ssmail.losses.labels`).
     """
-    wanted = labels.view(-1, *[1] * (mixed.dim() - 1))
+    target = labels.view(-1, *[1] * (mixed.dim() - 1))
     terms = {
         "generated": generated.square().mean(),
         "expert": (1 - expert).square().mean(),
-        "self_supervised": (wanted - mixed).square().mean(),
+        "self_supervised": (target - mixed).square().mean(),
     }
     return terms["generated"] + terms["expert"] + terms["self_supervised"], terms
 
 
+def ssail_reward(output: Tensor) -> Tensor:
+    """D itself: Alg. 1 trains the policy to increase the expectation of D."""
+    return output
+
+
 def gail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:
-    """Binary cross-entropy -log(1 - sigmoid(D(tau_G))) - log sigmoid(D(tau_E)) of logits (Eq. 1, with the labels of
-    ssmail).
+    """Binary cross-entropy of logits, -log(1 - sigmoid(D(tau_G))) - log sigmoid(D(tau_E)): Eq. 1 with ssmail's labels.
 
     Where generated and expert data have densities p_G and p_E, the optimal logit is log(p_E / p_G).
     """
@@ -39,10 +43,24 @@ def gail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:
     return terms["generated"] + terms["expert"], terms
 
 
+def gail_reward(logit: Tensor) -> Tensor:
+    """-log(1 - sigmoid(logit)) = softplus(logit), never negative; sigmoid(logit) is the probability of "expert".
+
+    Ho and Ermon (2016) minimize E_pi[log D] with D = 1 on the policy. With ssmail's labels their D is
+    1 - sigmoid(logit), so the reward to maximize is -log(1 - sigmoid(logit)). softplus does not overflow.
+    """
+    return nn.functional.softplus(logit)
+
+
 def wail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:
     """mean D(tau_G) - mean D(tau_E): minus the critic's estimate of the Wasserstein distance (Eq. 2)."""
     terms = {"generated": generated.mean(), "expert": -expert.mean()}
     return terms["generated"] + terms["expert"], terms
+
+
+def wail_reward(output: Tensor) -> Tensor:
+    """The Wasserstein critic's output, which is trained to be high on the expert (Xiao et al. 2019)."""
+    return output
 
 
 def gradient_penalty(
@@ -51,14 +69,14 @@ def gradient_penalty(
     expert: tuple[Tensor, Tensor],
     mix: Tensor,
 ) -> Tensor:
-    """E[(|| grad || - 1)^2] between generated and expert transitions (Gulrajani et al. 2017).
+    """WGAN-GP: E[(||gradient|| - 1)^2] between generated and expert transitions (Gulrajani et al. 2017).
 
-    generated and expert are (features (B, T, N, F), actions (B, T, N, A)); mix (B, T) in [0, 1] is one draw per
-    transition, shared by its agents. The norm is that of each agent's own inputs, in the gradient of the sum of all
-    agents' scores: a critic of one agent alone gets the usual penalty, and what agents hear of each other counts too.
+    generated, expert: features (B, T, N, F) and actions (B, T, N, A). mix: (B, T) in [0, 1], one draw per transition,
+    which its agents share. The gradient is that of the sum of all agents' scores, and the norm that of each agent's own
+    inputs. So a critic of a single agent gets the usual penalty, and the influence of agents on each other counts too.
     """
     weight = mix[..., None, None]
     inputs = [torch.lerp(g, e, weight).requires_grad_() for g, e in zip(generated, expert, strict=True)]
     gradients = torch.autograd.grad(critic(*inputs).sum(), inputs, create_graph=True)
-    norm = torch.cat(gradients, dim=-1).square().sum(dim=-1).add(1e-12).sqrt()
+    norm = torch.cat(gradients, dim=-1).square().sum(dim=-1).add(1e-12).sqrt()  # (B, T, N); differentiable at 0
     return (norm - 1).square().mean()

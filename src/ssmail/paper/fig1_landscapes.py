@@ -11,6 +11,10 @@ The numbers of every seed are in the CSV and the notes: the stored metrics `land
 
 Deviation: ssail is trained as A.2 says (alpha in [-1, 1.5], reward 0 above 1) where experiments.yaml says so for the
 environment, whichever it is.
+
+Claim C7: GAIL's reward is nearly flat, SS-AIL's slopes towards the expert everywhere. A slope is usable when it is at
+least a quarter of what an even rise over the plane would have (`ssmail.evaluation.landscape`); the cosine is that
+between the slope and the direction to the expert.
 """
 
 from collections.abc import Sequence
@@ -26,6 +30,9 @@ from matplotlib.lines import Line2D
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
@@ -35,6 +42,19 @@ from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig1"
 SHARE, COSINE = "landscape/slope_share", "landscape/cosine"
+CLAIM = Claim(
+    name="C7",
+    alias="landscapes",
+    sentence="GAIL's reward is almost constant but for a sliver at its boundary; SS-AIL's has a clear slope towards "
+    "the expert everywhere.",
+    section="1",
+    figure=NAME,
+)
+FLAT = 0.5  # of the plane: a reward that has a usable slope on less than this is nearly flat
+EVERYWHERE = 0.9  # of the plane
+TOWARDS = 0.5  # cosine: within 60 degrees
+SHARE_STATISTIC = f"{SHARE}: share of the plane where the learned reward has a usable slope, after training"
+COSINE_STATISTIC = f"{COSINE}: mean cosine between that slope and the direction to the expert, after training"
 THRESHOLDS = (0.1, USABLE, 0.5)  # of the slope share, as fractions of the even slope; the metric has the second
 
 
@@ -177,6 +197,24 @@ def _number_rows(measured: Measured) -> pd.DataFrame:
     last = int(numbers["epoch"].max()) if len(numbers) else 0
     shares = {"threshold": THRESHOLDS, "slope_share": measured.shares}
     return pd.concat([numbers, pd.DataFrame({"kind": "share", "epoch": last, **named, **shares})])
+
+
+def samples(runs: Runs) -> tuple[Sample, ...]:
+    """Slope shares of gail and of ssail, and cosines of ssail."""
+    return (
+        runs.metric("gail", SHARE, diverged=WORST),
+        runs.metric("ssail", SHARE, diverged=LEAST),
+        runs.metric("ssail", COSINE, diverged=LEAST),
+    )
+
+
+def decide(share_gail: Sample, share_ssail: Sample, cosine_ssail: Sample) -> tuple[Part, ...]:
+    """Decide C7 from its `samples`."""
+    return (
+        median_seed("gail's reward is nearly flat", SHARE_STATISTIC, share_gail, "below", FLAT),
+        median_seed("ssail's reward has a slope everywhere", SHARE_STATISTIC, share_ssail, "above", EVERYWHERE),
+        median_seed("ssail's reward slopes towards the expert", COSINE_STATISTIC, cosine_ssail, "above", TOWARDS),
+    )
 
 
 def draw(record: LandscapesRecord) -> Figure:

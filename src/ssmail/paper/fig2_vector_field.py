@@ -11,6 +11,9 @@ the gradient is nil, there is no arrow.
 A panel for each range shows one seed, the one with the median `landscape/behind_cosine` (the lower of two): the mean
 cosine between gradient and way to the expert over all points with a negative alpha, over all rollouts, steps and
 agents. The numbers of every seed are in the CSV and the notes.
+
+Claim C8: behind the current trajectory the slope of D points to the expert only if D has seen negative alpha. Behind is
+where alpha is negative: on the far side of the current trajectory, seen from the expert.
 """
 
 from collections.abc import Sequence
@@ -22,11 +25,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.experiments import as_written
+from ssmail.config.experiments import display_value
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import cosines
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
+from ssmail.plots.formatting import setting
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection
 from ssmail.plots.series import figure_ablation, select
@@ -34,11 +41,25 @@ from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
+CLAIM = Claim(
+    name="C8",
+    alias="vector-field",
+    sentence="With alpha from [0, 1] alone the field behind the current trajectory is left to chance; negative alpha "
+    "completes it, so that it points to the expert there too.",
+    section="3.1.3",
+    figure=NAME,
+)
+POSITIVE, BOTH = (0.0, 1.0), (-1.0, 1.0)  # what alpha is drawn from
+TO_THE_EXPERT = 0.5  # cosine: within 60 degrees
+BEHIND_STATISTIC = (
+    f"{BEHIND}: mean cosine between D's slope and the direction to the expert at negative alpha, "
+    "after half of the epochs"
+)
 STEPS = 10  # of a trajectory, at which arrows stand
 TRAJECTORIES = 1
 REACH = 0.7  # how far the frame follows a policy that leaves the expert, as a share of the expert's longer side
 MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
-TOWARDS, AWAY = "#009E73", "#CC79A7"
+TOWARDS, AWAY = "#009E73", "#CC79A7"  # colours
 ARROW = 0.03  # length, as a share of the frame's width
 
 
@@ -144,7 +165,9 @@ def _of_the_paper(selection: Selection) -> Selection:
     others = [group.label for group in selection.groups if group.value not in values]
     if not groups or not others:
         return selection
-    note = f"left out, for the figure compares {' and '.join(map(str, map(as_written, values)))}: {', '.join(others)}."
+    note = (
+        f"left out, for the figure compares {' and '.join(map(str, map(display_value, values)))}: {', '.join(others)}."
+    )
     return Selection(groups, (*selection.notes, note))
 
 
@@ -213,6 +236,23 @@ def _field_rows(field: Field) -> list[pd.DataFrame]:
     columns |= {"x": places[..., 0].ravel(), "y": places[..., 1].ravel(), "cosine": cosine.ravel()}
     columns |= {"gradient_x": gradient[..., 0].ravel(), "gradient_y": gradient[..., 1].ravel()}
     return [*rows, pd.DataFrame({"kind": "arrow", **named, **columns})]
+
+
+def samples(runs: Runs) -> tuple[Sample, ...]:
+    """Behind cosines with alpha drawn from POSITIVE and from BOTH."""
+    return (
+        runs.metric(POSITIVE, BEHIND, diverged=WORST, label=f"alpha {setting(POSITIVE)}"),
+        runs.metric(BOTH, BEHIND, diverged=LEAST, label=f"alpha {setting(BOTH)}"),
+    )
+
+
+def decide(positive: Sample, both: Sample) -> tuple[Part, ...]:
+    """Decide C8 from its `samples`."""
+    without = "without negative alpha the field behind does not point to the expert"
+    return (
+        median_seed(without, BEHIND_STATISTIC, positive, "below", TO_THE_EXPERT),
+        median_seed("with negative alpha it does", BEHIND_STATISTIC, both, "above", TO_THE_EXPERT),
+    )
 
 
 def draw(record: VectorFieldRecord) -> Figure:

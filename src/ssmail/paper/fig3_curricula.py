@@ -3,6 +3,10 @@
 For each curriculum of the ablation `curriculum` the measured mean segment length (`curriculum/segment_length`) of every
 seed, its centre and spread over all runs, and over it, dashed and black, the closed form that a run stores with the
 measurement: T / (1 + (T - 1) f) steps for T steps and the intervention probability f of the epoch.
+
+Claim C6 (section 3.3): trajectory forcing lengthens the segments between interventions gradually. It uses the measured
+lengths, because the closed form is the same for all seeds. Gradual is judged against scheduled sampling, which the
+paper calls less smooth (in a passage that is commented out).
 """
 
 from collections.abc import Sequence
@@ -18,6 +22,9 @@ from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import median_seed, smaller
+from ssmail.paper.samples import LEAST, WORST, Floats, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band, silent
 from ssmail.plots.provenance import Provenance
@@ -28,6 +35,18 @@ from ssmail.store import Store
 NAME = "fig3"
 DASHES = (0, (4, 2))
 MEASURED, EXPECTED = "curriculum/segment_length", "curriculum/expected_segment_length"
+CLAIM = Claim(
+    name="C6",
+    alias="curricula",
+    sentence="Trajectory forcing lengthens the generated segments gradually over training, more smoothly than "
+    "scheduled sampling does.",
+    section="3.3",
+    figure=NAME,
+)
+FORCING, SAMPLING = "trajectory-forcing", "scheduled-sampling"
+LONGER = 2.0  # times
+GROWTH = f"{MEASURED}, mean of the last fifth of the epochs over that of the first fifth"
+JUMP = f"largest rise of {MEASURED} from an epoch to the next, as a share of the whole rise"
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +98,34 @@ def collect(
 def _longest(group: Group, expected: pd.DataFrame, statistic: Statistic) -> Curve:
     """The closed form is the same for every seed, so that of the run with the most epochs tells it."""
     return max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
+
+
+def growth(lengths: Floats) -> float:
+    """Compute GROWTH from (E,) lengths in steps."""
+    return end_mean(lengths) / beginning_mean(lengths)
+
+
+def largest_jump(lengths: Floats) -> float:
+    """Compute JUMP from (E,) lengths in steps. The whole rise is from shortest to longest; without one, NaN."""
+    whole = np.ptp(lengths) if len(lengths) > 1 else 0.0
+    return float(np.diff(lengths).max() / whole) if whole > 0 else np.nan
+
+
+def samples(runs: Runs) -> tuple[Sample, ...]:
+    """Growth and largest jump under FORCING, and the largest jump under SAMPLING."""
+    return (
+        runs.curves(FORCING, [MEASURED], growth, diverged=LEAST),
+        runs.curves(FORCING, [MEASURED], largest_jump, diverged=WORST),
+        runs.curves(SAMPLING, [MEASURED], largest_jump, diverged=LEAST),
+    )
+
+
+def decide(grown: Sample, jump: Sample, jump_sampling: Sample) -> tuple[Part, ...]:
+    """Decide C6 from its `samples`."""
+    return (
+        median_seed("trajectory forcing at least doubles the segments", GROWTH, grown, "above", LONGER),
+        smaller("trajectory forcing is smoother than scheduled sampling", JUMP, jump, jump_sampling),
+    )
 
 
 def draw(record: CurriculaRecord) -> Figure:

@@ -9,6 +9,11 @@ driving straight on costs. The scale ends at `curves.CEILING`, where every posit
 counts as diverged; what rises above it is told in a note.
 
 Deviation: the paper's figure shows mean and standard deviation alone, and its authors discarded runs that failed.
+
+Claim C1: SS-AIL converges for every seed, GAIL and WAIL do not, and fluctuate. The paper's error is of training; a
+policy that converged has a small validation error as well, so both are asked for. "Converges to zero" becomes: a tenth
+of what driving straight on costs. "Fluctuates" is measured on the logarithm of the error, so that a method is not
+called unsteady for being worse, which other parts decide.
 """
 
 from collections.abc import Sequence
@@ -20,8 +25,11 @@ from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import every_seed, median_seed, smaller
+from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.constant_velocity import constant_velocity
+from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
 from ssmail.plots.curves import Band, band, silent
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.series import select
@@ -29,6 +37,22 @@ from ssmail.store import Store
 
 NAME = "fig4"
 METRIC = "train/mode_mse"
+CLAIM = Claim(
+    name="C1",
+    alias="stability",
+    sentence="The training error of SS-AIL converges to zero for every initialisation; GAIL and WAIL cannot converge, "
+    "and fluctuate considerably.",
+    section="4.2",
+    figure=NAME,
+)
+METHODS = ("ssail", "gail", "wail")
+CONVERGED = 0.1  # of constant velocity's error
+SMALLEST = 1e-12  # squared scaled units: a smaller error counts as this, so that it has a logarithm
+REMAINING = (
+    "mode_mse, mean of the last fifth of the epochs, as a fraction of constant velocity's test error; "
+    "the larger of training and validation"
+)
+FLUCTUATION = f"mean |ln(error / error of the epoch before)| of {METRIC} over the last half of the epochs"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +99,39 @@ def collect(
         constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
         notes=(*selection.notes, *curve_notes.high(bands), *curve_notes.cut(bands), *curve_notes.comparisons(bands)),
+    )
+
+
+def remaining_error(train: Floats, validation: Floats, constant_velocity: Floats) -> float:
+    """Compute REMAINING from (E,) training and validation errors and (1,) constant velocity, squared scaled units."""
+    return float(np.maximum(end_mean(train), end_mean(validation)) / constant_velocity[-1])
+
+
+def fluctuation(errors: Floats) -> float:
+    """Compute FLUCTUATION from (E,) errors; NaN with fewer than two epochs, and where an error is not finite."""
+    last = errors[min(len(errors) // 2, max(len(errors) - 2, 0)) :]
+    if len(last) < 2 or not np.isfinite(errors).all():
+        return np.nan
+    return float(np.abs(np.diff(np.log(np.maximum(last, SMALLEST)))).mean())
+
+
+def samples(runs: Runs) -> tuple[tuple[Sample, ...], tuple[Sample, ...]]:
+    """Remaining errors and fluctuations, each in the order of METHODS."""
+    errors = (METRIC, "validation/mode_mse", f"{REFERENCE}/mode_mse")
+    return (
+        tuple(runs.curves(method, errors, remaining_error, diverged=WORST) for method in METHODS),
+        tuple(runs.curves(method, [METRIC], fluctuation, diverged=WORST) for method in METHODS),
+    )
+
+
+def decide(remaining: Sequence[Sample], fluctuations: Sequence[Sample]) -> tuple[Part, ...]:
+    """Decide C1 from its `samples`."""
+    ssail, *others = remaining
+    steady, *unsteady = fluctuations
+    return (
+        every_seed("ssail converges on every seed", REMAINING, ssail, "below", CONVERGED),
+        *(median_seed(f"{o.label} does not converge", REMAINING, o, "above", CONVERGED) for o in others),
+        *(smaller(f"{o.label} fluctuates more than ssail", FLUCTUATION, steady, o) for o in unsteady),
     )
 
 

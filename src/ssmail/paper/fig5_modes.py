@@ -8,6 +8,10 @@ A run that diverged has no test rollouts: its panel says so. A rollout that leav
 The grey lines are drawn wide, to be seen beneath the rollouts; their width means nothing.
 
 Deviation: the paper shows one trajectory set for each method; here every seed has its panel.
+
+Claim C2: SS-AIL ends on either lane, DNRI averages the lanes. To average is to end nearer to the middle between the two
+continuations of a start than to either of them. A policy that takes one lane alone does not differentiate between the
+lanes either, so both have to be used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,6 +26,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ssmail.errors import InputError
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection
@@ -31,6 +38,23 @@ from ssmail.store import RunRow, RunState, Store
 NAME = "fig5"
 STARTS = 16
 ON_LANE, LANE_BALANCE = "test/on_lane", "test/lane_balance"
+ROLLOUTS, LANES = "test/rollouts", "test/lanes"
+CLAIM = Claim(
+    name="C2",
+    alias="modes",
+    sentence="SS-AIL converges to the different modes of the expert and tells them apart; DNRI averages over them.",
+    section="4.3",
+    figure=NAME,
+)
+ENDS_ON_LANE = 0.9  # of the agents
+TAKES_BOTH_LANES = 0.1  # of the rollouts take the rarer lane
+AVERAGES = 0.5  # of the agents
+ON_LANE_STATISTIC = f"{ON_LANE}: share of agents of sampled test rollouts that end on a lane"
+BALANCE_STATISTIC = f"{LANE_BALANCE}: share of sampled test rollouts that take the rarer lane"
+BETWEEN_STATISTIC = (
+    "share of agents of the test rollouts that figure 5 shows that end, along the line between the expert's two "
+    "continuations of their start, nearer to its middle than to either end"
+)
 REACH = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
 LANE_WIDTH = 3.5  # points: the expert shows as a wide lane beneath the rollouts
 
@@ -108,7 +132,7 @@ def _shown(starts: int) -> npt.NDArray[np.int64]:
 
 
 def _expert(store: Store, run: RunRow) -> Floats:
-    return shown_lanes(store.array(run.id, "test/lanes"))
+    return shown_lanes(store.array(run.id, LANES))
 
 
 def shown_lanes(lanes: Floats) -> Floats:
@@ -122,7 +146,7 @@ def shown_rollouts(samples: Floats) -> Floats:
     return samples[np.arange(len(starts)) % len(samples), starts][None]
 
 
-THINNINGS = {"test/lanes": shown_lanes, "test/rollouts": shown_rollouts}
+THINNINGS = {LANES: shown_lanes, ROLLOUTS: shown_rollouts}
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
@@ -148,7 +172,7 @@ def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
 def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
         return Panel(label, run.id, run.seed, None, np.nan, np.nan)
-    rollouts = shown_rollouts(store.array(run.id, "test/rollouts"))[0]
+    rollouts = shown_rollouts(store.array(run.id, ROLLOUTS))[0]
     return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
 
 
@@ -166,6 +190,37 @@ def _panel_rows(panel: Panel) -> pd.DataFrame:
         return pd.DataFrame([{"kind": "diverged", **run}])
     shares = {"on_lane": panel.on_lane, "lane_balance": panel.lane_balance}
     return _points(panel.rollouts, kind="rollout", **run, **shares)
+
+
+def share_between(rollouts: Floats, lanes: Floats) -> float:
+    """Compute BETWEEN_STATISTIC from stored rollouts (S, B, T, N, 2) and lanes (2, B, T, N, 2).
+
+    An end that is not finite is not between the lanes.
+    """
+    ends = shown_rollouts(rollouts)[:, :, -1]
+    left, right = shown_lanes(lanes)[:, :, -1].astype(np.float64)  # (B, N, 2) each
+    across = right - left
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        place = ((ends - left) * across).sum(axis=-1) / np.square(across).sum(axis=-1)  # 0: left, 1: right
+        return float(np.mean(np.abs(place - 0.5) < 0.25))
+
+
+def samples(runs: Runs) -> tuple[Sample, ...]:
+    """on_lane and lane_balance of ssail, and the share of dnri's agents that end between the lanes."""
+    return (
+        runs.metric("ssail", ON_LANE, diverged=LEAST),
+        runs.metric("ssail", LANE_BALANCE, diverged=LEAST),
+        runs.arrays("dnri", [ROLLOUTS, LANES], share_between, diverged=LEAST),
+    )
+
+
+def decide(on_lane: Sample, balance: Sample, between: Sample) -> tuple[Part, ...]:
+    """Decide C2 from its `samples`."""
+    return (
+        median_seed("ssail ends on a lane", ON_LANE_STATISTIC, on_lane, "above", ENDS_ON_LANE),
+        median_seed("ssail takes both lanes", BALANCE_STATISTIC, balance, "above", TAKES_BOTH_LANES),
+        median_seed("dnri ends between the lanes", BETWEEN_STATISTIC, between, "above", AVERAGES),
+    )
 
 
 def draw(record: ModesRecord) -> Figure:

@@ -16,7 +16,11 @@ The slope of a curve is that of the least-squares line through the last half of 
 scaled units per step: of each run, and of a method the mean over its runs with Student's t-interval. A run without a
 finite error at all of these steps has none, and then its method has none.
 
-Deviation: the paper shows mean and standard deviation with noise alone, and tells of the slope in words.
+Deviation: the paper shows mean and standard deviation with noise alone, and describes the slope in words.
+
+Claim C4: with noise, DNRI's error and its spread grow with the horizon, and SS-AIL's error grows ever more slowly. The
+paper does not say over what its standard deviation is taken; here it is over test windows, so that each seed has its
+own.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +28,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -33,6 +36,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
 
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
+from ssmail.paper.claims import Claim, Part, Sample
+from ssmail.paper.hypotheses import median_seed, smaller
+from ssmail.paper.samples import WORST, Floats, Runs
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE
 from ssmail.plots.curves import Band, Curve, band
@@ -44,10 +50,21 @@ from ssmail.store import RunRow, RunState, Store
 NAME = "fig7"
 CONDITIONS = {"clean": "", "noisy": "_noisy"}  # what is told of the input -> the end of the arrays' prefixes
 METRIC = "test/mse"
+CLAIM = Claim(
+    name="C4",
+    alias="noise",
+    sentence="With noisy input DNRI deviates further the longer it predicts, and its standard deviation grows too; "
+    "SS-AIL's error does not grow linearly, and its slope falls.",
+    section="4.6",
+    figure=NAME,
+)
+NOISY, SPREAD = "test_noisy/mse", "test_noisy/mse_spread"
+GROWTH = f"slope of the least-squares line through {NOISY} over all predicted steps, squared scaled units per step"
+SPREADING = f"likewise of {SPREAD}, the standard deviation over test windows"
+LATE = f"slope of {NOISY} over the last half of the predicted steps, squared scaled units per step"
+BENDING = f"slope of {NOISY} over the last half of the predicted steps minus that over the first half"
 REACH = 4.0
 REFERENCE_REACH = 8.0
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +198,7 @@ def _panel(store: Store, selection: Selection, condition: str, statistic: Statis
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
     references = [store.array(run.id, f"{REFERENCE}{end}/mse") for run in finished]  # those on one data set agree
     reference = np.median(references, axis=0) if references else np.empty(0)
-    return Panel(condition, bands, tuple(map(_slopes, bands)), reference, _slope(reference))
+    return Panel(condition, bands, tuple(map(_slopes, bands)), reference, late_slope(reference))
 
 
 def _over_steps(errors: dict[str, Floats]) -> pd.DataFrame:
@@ -196,16 +213,25 @@ def _finite(curve: Curve) -> Floats:
 
 
 def _slopes(shown: Band) -> Slopes:
-    runs = np.array([_slope(curve.values) for curve in shown.curves])
+    runs = np.array([late_slope(curve.values) for curve in shown.curves])
     return Slopes(runs, mean_interval(runs))
 
 
-def _slope(errors: Floats) -> float:
-    """Of the least-squares line through the last half of (T,) errors, per step."""
-    last = errors[_first_of_slope(len(errors)) - 1 :]
-    if len(last) < 2 or not np.isfinite(last).all():
+def slope(errors: Floats) -> float:
+    """The slope per step of the least-squares line through (T,) errors; NaN of fewer than two, or where not finite."""
+    if len(errors) < 2 or not np.isfinite(errors).all():
         return np.nan
-    return float(np.polyfit(np.arange(len(last)), last, deg=1)[0])
+    return float(np.polyfit(np.arange(len(errors)), errors, deg=1)[0])
+
+
+def late_slope(errors: Floats) -> float:
+    """The slope over the last half of (T,) errors."""
+    return slope(errors[_first_of_slope(len(errors)) - 1 :])
+
+
+def bending(errors: Floats) -> float:
+    """Compute BENDING from (T,) errors. Negative: the error grows ever more slowly."""
+    return late_slope(errors) - slope(errors[: len(errors) // 2])
 
 
 def _first_of_slope(steps: int) -> int:
@@ -232,6 +258,27 @@ def _told(slopes: Slopes) -> str:
     if not np.isfinite(mean):
         return f"none ({np.isnan(slopes.runs).sum()} of {len(slopes.runs)} runs without finite errors)"
     return f"{mean:.2g} " + (f"({low:.2g} to {high:.2g})" if np.isfinite(low) else "(one run)")
+
+
+def samples(runs: Runs) -> tuple[Sample, ...]:
+    """Growth of dnri's error and spread, bending and late slope of ssail's error, and late slope of dnri's."""
+    return (
+        runs.arrays("dnri", [NOISY], slope, diverged=WORST),
+        runs.arrays("dnri", [SPREAD], slope, diverged=WORST),
+        runs.arrays("ssail", [NOISY], bending, diverged=WORST),
+        runs.arrays("ssail", [NOISY], late_slope, diverged=WORST),
+        runs.arrays("dnri", [NOISY], late_slope, diverged=WORST),
+    )
+
+
+def decide(growth: Sample, spreading: Sample, bent: Sample, late: Sample, late_dnri: Sample) -> tuple[Part, ...]:
+    """Decide C4 from its `samples`."""
+    return (
+        median_seed("dnri's error grows with the horizon", GROWTH, growth, "above", 0.0),
+        median_seed("dnri's spread grows with the horizon", SPREADING, spreading, "above", 0.0),
+        median_seed("ssail's slope falls with the horizon", BENDING, bent, "below", 0.0),
+        smaller("ssail's error grows more slowly than dnri's at long horizons", LATE, late, late_dnri),
+    )
 
 
 def draw(record: NoiseRecord) -> Figure:

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmail.config.keys import unknown_name
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
-from ssmail.paper.collectors import COLLECTORS
-from ssmail.paper.samples import EMPTY, Runs
+from ssmail.paper.results import CLAIMS, FIGURES
+from ssmail.paper.samples import Runs
 from ssmail.store import Store
 
 FEW = 5  # seeds that a claim without runs is given to begin with
@@ -41,13 +40,15 @@ def judge(store: Store, profile: str | None = None, only: Sequence[str] | None =
 
     All are judged in any case, for Holm's correction counts eight claims. Raises InputError for an unknown claim.
     """
-    names = {key: c.claim.name for c in COLLECTORS for key in (c.claim.name, c.claim.name.lower(), c.claim.alias)}
+    figures = [FIGURES[name] for name in CLAIMS]
+    claims = [figure.claim for figure in figures]
+    names = {key: claim.name for claim in claims for key in (claim.name, claim.name.lower(), claim.alias)}
     for name in only or ():
         if name not in names:
             raise unknown_name("claim", name, names)
     wanted = {names[name] for name in only} if only else set(names.values())
-    found = [(c.claim, *_runs(store, c.claim, profile)) for c in COLLECTORS]
-    decisions = [Decision(c.parts(runs)) for c, (_, runs, _) in zip(COLLECTORS, found, strict=True)]
+    found = [(claim, *_runs(store, claim, profile)) for claim in claims]
+    decisions = [Decision(figure.decide(runs)) for figure, (_, runs, _) in zip(figures, found, strict=True)]
     adjusted = holm([decision.p for decision in decisions])
     return [
         _judgement(claim, runs, notes, decision, p, profile)
@@ -59,9 +60,9 @@ def judge(store: Store, profile: str | None = None, only: Sequence[str] | None =
 def _runs(store: Store, claim: Claim, profile: str | None) -> tuple[Runs, tuple[str, ...]]:
     """The claim's runs and notes; runs that cannot be compared are none, and the note says why."""
     try:
-        runs = Runs.of(store, claim.figure, profile)
+        runs = Runs.of_figure(store, claim.figure, profile)
     except InputError as error:
-        return Runs(store, EMPTY), (str(error),)
+        return Runs(store), (str(error),)
     return runs, runs.selection.notes
 
 

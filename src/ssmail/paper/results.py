@@ -1,8 +1,9 @@
-"""The figures of the paper, redrawn from the store alone; `training_curves` and `landscape_film`, for questions that it
-does not ask; and `skeleton`, a picture of the motion-capture data.
+"""The nine figures of the paper and the eight claims that are read off them.
 
-Each figure module has two halves: `collect(store)` gives a frozen record of what is shown, `draw(record)` a matplotlib
-Figure. Importing this package imports neither matplotlib nor pandas; a figure's module is imported when it is used.
+Each figure has a module. Its `collect(store)` returns a frozen record of what is shown, and `draw(record)` a matplotlib
+Figure. Where a claim is read off the figure, the module also has the CLAIM, `samples(runs)`, which reads its numbers
+from the store, and `decide(*samples)`, which tests them. Importing this table imports neither matplotlib nor pandas: a
+figure's module is imported when it is used.
 """
 
 import importlib
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ssmail.evaluation.statistics import Statistic
+    from ssmail.paper.claims import Claim, Part
+    from ssmail.paper.samples import Runs
     from ssmail.store import Store
     from ssmail.store.maintenance.compact import Thinning
 
@@ -61,6 +64,16 @@ class FigureModule:
         """The record as a matplotlib Figure, one column wide."""
         return cast("Figure", self._module().draw(record))
 
+    @property
+    def claim(self) -> "Claim":
+        """The claim that is read off the figure, of one of CLAIMS."""
+        return cast("Claim", self._module().CLAIM)
+
+    def decide(self, runs: "Runs") -> "tuple[Part, ...]":
+        """The tested parts of the claim, from the figure's runs."""
+        module = self._module()
+        return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
+
     def thinnings(self) -> "Mapping[str, Thinning]":
         """By the names of stored arrays, what makes of each the part that the figure shows, where it does not show all.
 
@@ -87,6 +100,9 @@ _MODULES = (
 )
 
 FIGURES: dict[str, FigureModule] = {key: module for module in _MODULES for key in (module.name, module.alias)}
+
+CLAIMS = ("fig4", "fig5", "fig6", "fig7", "fig8", "fig3", "fig1", "fig2")
+"""The figures whose modules decide the claims C1 to C8, in this order."""
 
 
 def save(

@@ -1,10 +1,11 @@
-"""The runs of a claim, by group, and samples of one number for each run.
+"""The runs that decide a claim, and samples of one number per run.
 
-A run that diverged counts as the worst: +inf of an error, and what counts against the claim of anything else. A
-finished run that did not store what is asked for is unknown (NaN).
+Each sample states what a diverged run counts as: WORST for an error, LEAST for a quantity that should be large, and
+otherwise whatever speaks against the claim. A finished run counts as diverged when a value that its number is computed
+from is not finite, so that there is no number. A finished run that did not store such a value is unknown (NaN).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,60 +21,121 @@ from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
 Floats = npt.NDArray[np.float64]
-EMPTY = Selection((), ())
+Array = npt.NDArray[Any]
+
+WORST, LEAST = np.inf, -np.inf  # what a diverged run counts as
+NO_SELECTION = Selection((), ())
+PARTS = 5  # the first and the last fifth of the epochs are the beginning and the end of training
 
 
 @dataclass(frozen=True)
 class Runs:
-    """The runs that a figure draws, and the store to read them from."""
+    """The runs that a figure draws, in groups, and the store to read their numbers from.
+
+    A group is named by its method, or by its value of the ablation's key; samples are labelled with that name unless
+    `label` is given. A group without runs gives an empty sample.
+    """
 
     store: Store
-    selection: Selection
+    selection: Selection = NO_SELECTION
 
     @classmethod
-    def of(cls, store: Store, figure: str, profile: str | None) -> "Runs":
-        """As the figure chooses them by default; none when there are none.
+    def of_figure(cls, store: Store, figure: str, profile: str | None) -> "Runs":
+        """The runs that the figure chooses by default; without any, no groups.
 
         Raises InputError for an unknown figure and for runs on different data.
         """
         try:
             return cls(store, select(store, figure, profile=profile))
         except NoRuns:
-            return cls(store, EMPTY)
+            return cls(store)
 
-    def group(self, key: Any) -> Group:
-        """The runs of a method (its name), or of a value of the ablation's key; empty when there are none."""
-        for group in self.selection.groups:
-            if key in (group.value, group.label):
-                return group
-        return Group(str(key), ())
-
-    def sample(self, group: Group, label: str, value: Callable[[RunRow], float], diverged: float) -> Sample:
-        """What `value` gives for every finished run of the group, and `diverged` for every diverged one."""
-        return Sample(
-            label=label,
-            seeds=tuple(run.seed for run in group.runs),
-            values=tuple(diverged if run.state is RunState.DIVERGED else value(run) for run in group.runs),
-            runs=tuple(run.id for run in group.runs),
-        )
-
-    def metric(self, group: Group, label: str, name: str, diverged: float) -> Sample:
-        """The last value of a metric; an error that is not finite counts as diverged."""
-        known = latest_values(self.store, group.runs, [name])
+    def metric(self, group: Any, name: str, *, diverged: float, label: str | None = None) -> Sample:
+        """Sample the last value of a metric. An error that is not finite counts as diverged."""
+        known = latest_values(self.store, self._group(group).runs, [name])
 
         def value(run: RunRow) -> float:
             found = known.get((run.id, name), np.nan)
             lost = (run.id, name) in known and is_error(name) and not np.isfinite(found)
             return diverged if lost else found
 
-        return self.sample(group, label, value, diverged)
+        return self._sample(group, label, value, diverged)
 
-    def curve(self, run: RunRow, name: str) -> Floats:
-        """(E,) values of a metric over the epochs; empty when the run has none."""
-        found: Floats = self.store.metrics([run.id], names=[name])["value"].to_numpy(dtype=np.float64)
-        return found
+    def curves(
+        self,
+        group: Any,
+        names: Sequence[str],
+        number: Callable[..., float],
+        *,
+        diverged: float,
+        label: str | None = None,
+    ) -> Sample:
+        """Sample `number` of the metrics of these names, each (E,) values over the epochs."""
 
-    def arrays(self, run: RunRow, *names: str) -> list[npt.NDArray[Any]] | None:
-        """The arrays of these names; None when the run lacks one."""
-        there = self.store.array_names(run.id)
-        return [self.store.array(run.id, name) for name in names] if {*names} <= {*there} else None
+        def read(run: RunRow) -> list[Array]:
+            curves = (self.store.metrics([run.id], names=[name])["value"] for name in names)
+            return [curve.to_numpy(dtype=np.float64) for curve in curves]
+
+        return self._sample(group, label, _computed(read, number, diverged), diverged)
+
+    def arrays(
+        self,
+        group: Any,
+        names: Sequence[str],
+        number: Callable[..., float],
+        *,
+        diverged: float,
+        label: str | None = None,
+    ) -> Sample:
+        """Sample `number` of the arrays of these names, which every run stores at its end."""
+
+        def read(run: RunRow) -> list[Array]:
+            there = {*names} <= {*self.store.array_names(run.id)}
+            return [self.store.array(run.id, name) if there else np.empty(0) for name in names]
+
+        return self._sample(group, label, _computed(read, number, diverged), diverged)
+
+    def _group(self, key: Any) -> Group:
+        for group in self.selection.groups:
+            if key in (group.value, group.label):
+                return group
+        return Group(str(key), ())
+
+    def _sample(self, group: Any, label: str | None, value: Callable[[RunRow], float], diverged: float) -> Sample:
+        runs = self._group(group).runs
+        return Sample(
+            label=label or str(group),
+            seeds=tuple(run.seed for run in runs),
+            values=tuple(diverged if run.state is RunState.DIVERGED else value(run) for run in runs),
+            runs=tuple(run.id for run in runs),
+        )
+
+
+def _computed(
+    read: Callable[[RunRow], list[Array]], number: Callable[..., float], diverged: float
+) -> Callable[[RunRow], float]:
+    """The function that computes a finished run's number from what `read` finds: see the top of this module."""
+
+    def value(run: RunRow) -> float:
+        values = read(run)
+        if not all(len(found) for found in values):
+            return np.nan
+        found = number(*values)
+        lost = np.isnan(found) and not all(np.isfinite(array).all() for array in values)
+        return diverged if lost else found
+
+    return value
+
+
+def end_mean(values: Floats) -> float:
+    """Mean of the last fifth of (E,) values, at least one; NaN where a value is not finite, and without any."""
+    return _finite_mean(values[-max(len(values) // PARTS, 1) :])
+
+
+def beginning_mean(values: Floats) -> float:
+    """Mean of the first fifth of (E,) values, at least one; NaN where a value is not finite, and without any."""
+    return _finite_mean(values[: max(len(values) // PARTS, 1)])
+
+
+def _finite_mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) and np.isfinite(values).all() else np.nan

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssmail.config.experiments import frozen
-from ssmail.config.keys import leaves
+from ssmail.config.experiments import to_tuples
+from ssmail.config.spec import flatten
 from ssmail.errors import InputError
 from ssmail.store import RunRow
 
@@ -60,12 +60,12 @@ def newest_of_each_seed(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:
 
 def value_of(run: RunRow, key: str) -> Any:
     """Return the value of a dotted key in the run's spec; ABSENT where there is none."""
-    return frozen(dict(leaves(run.spec)).get(key, ABSENT))
+    return to_tuples(flatten(run.spec).get(key, ABSENT))
 
 
 def rest_of(run: RunRow, key: str) -> str:
     """Return the run's spec without the key, and without nulls, which earlier versions may have had no key for."""
-    values = {name: value for name, value in leaves(run.spec) if name != key and value is not None}
+    values = {name: value for name, value in flatten(run.spec).items() if name != key and value is not None}
     return json.dumps(values, sort_keys=True)
 
 

@@ -21,13 +21,12 @@ from ssmail.config.experiments import (
     Ablation,
     ablation,
     ablation_specs,
-    as_written,
     build_spec,
+    display_value,
     figure_requirements,
 )
 from ssmail.config.experiments_file import load_experiments
-from ssmail.config.keys import leaves
-from ssmail.config.spec import RunSpec
+from ssmail.config.spec import RunSpec, flatten
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted
@@ -102,7 +101,7 @@ def figure_specs(figure: str, profile: str) -> dict[RunSpec, dict[str, Any]]:
     if (varied := needed.ablation) is None:
         return {build_spec(method, needed.environment, profile): {"method": method} for method in needed.methods}
     specs = ablation_specs(varied.name, profile, environment=varied.environment)
-    return {spec: {"method": varied.method, varied.key: as_written(value)} for value, spec in specs.items()}
+    return {spec: {"method": varied.method, varied.key: display_value(value)} for value, spec in specs.items()}
 
 
 def needed_by(figure: str) -> Callable[[RunRow], bool]:
@@ -181,11 +180,11 @@ def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
 
 
 def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
-    first, known = runs[0], dict(leaves(runs[0].spec))
+    first, known = runs[0], flatten(runs[0].spec)
     for run in runs:
         if value_of(run, key) is ABSENT:
             raise InputError(f"run {run.name} ({run.method}) has no {key}, which {figure} compares; leave it out.")
-        other = dict(leaves(run.spec))
+        other = flatten(run.spec)
         differs = [name for name in known | other if name != key and known.get(name) != other.get(name)]
         if differs:
             raise InputError(
@@ -308,7 +307,7 @@ def _groups_of_values(
 
 
 def _value_label(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(as_written(value))
+    return f"{value:g}" if isinstance(value, float) else str(display_value(value))
 
 
 def _gaps(varied: Ablation, groups: Sequence[Group], seeds: Sequence[int], command: str | None) -> list[str]:

@@ -20,11 +20,10 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
-from ssmail.config.keys import unknown_name
 from ssmail.data import expert_file
 from ssmail.data.mocap.dataset import SPLITS
 from ssmail.data.trajectories import ExpertSet, Trajectories
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
 

@@ -18,8 +18,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.keys import leaves, unknown_name
-from ssmail.errors import InputError
+from ssmail.config.spec import flatten
+from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, silent
@@ -157,7 +157,7 @@ def _groups(runs: Sequence[RunRow], values: pd.DataFrame, group_by: str) -> tupl
 
 
 def _keys(run: RunRow) -> dict[str, Any]:
-    return {**dict(leaves(run.spec)), "seed": run.seed}
+    return {**flatten(run.spec), "seed": run.seed}
 
 
 def _hashable(value: Any) -> Hashable:
@@ -183,7 +183,7 @@ def _label(group_by: str, value: Hashable) -> str:
 def _split(name: str, runs: Sequence[RunRow], group_by: str) -> list[Group]:
     """A group for each spec, with the newest run of each seed."""
     specs = [newest_of_each_seed(found) for found in by_spec(runs)]
-    flat = [dict(leaves(found[0].spec)) for found in specs]
+    flat = [flatten(found[0].spec) for found in specs]
     if len(specs) == 1:
         return [Group(name, specs[0])]
     every = dict.fromkeys(key for values in flat for key in values if key != group_by)

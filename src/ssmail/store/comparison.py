@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssmail.config.keys import leaves
+from ssmail.config.spec import flatten
 from ssmail.store.queries import RunRow
 from ssmail.store.run_store import Store
 from ssmail.store.schema import RunState
@@ -105,7 +105,7 @@ def _comparison(
 
 def _differences(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """For each spec, the dotted keys whose values are not the same in all of them."""
-    flat = {name: dict(leaves(spec)) for name, spec in specs.items()}
+    flat = {name: flatten(spec) for name, spec in specs.items()}
     keys = sorted({key for values in flat.values() for key in values} - {"method", "environment", "profile"})
     varying = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1]
     return {name: {key: values.get(key) for key in varying} for name, values in flat.items()}

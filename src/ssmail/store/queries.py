@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, Select, select
 
-from ssmail.config.spec import completed
+from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
 from ssmail.store import arrays, schema
 from ssmail.store.schema import RunState
@@ -58,7 +58,7 @@ class RunRow:
     @cached_property
     def spec(self) -> dict[str, Any]:
         """The run's spec as plain nested values, with what an earlier version had no key for."""
-        return completed(json.loads(self.spec_json))
+        return with_added_keys(json.loads(self.spec_json))
 
 
 @dataclass(frozen=True)

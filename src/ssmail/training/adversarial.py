@@ -10,10 +10,19 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import Pairing, SelfSupervisionSpec, used
-from ssmail.losses.adversarial import Terms, gail_loss, gradient_penalty, ssail_loss, wail_loss
+from ssmail.config.sections import Pairing, SelfSupervisionSpec, required
+from ssmail.config.user_functions import load_label
+from ssmail.losses import Terms
+from ssmail.losses.adversarial import (
+    gail_loss,
+    gail_reward,
+    gradient_penalty,
+    ssail_loss,
+    ssail_reward,
+    wail_loss,
+    wail_reward,
+)
 from ssmail.losses.labels import checked_label
-from ssmail.losses.rewards import gail_reward, ssail_reward, wail_reward
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
@@ -52,12 +61,14 @@ class AdversarialLearner:
 
     def __init__(self, setting: Setting) -> None:
         spec = setting.spec
-        model, sac = used(spec.model), used(spec.sac)
+        model, sac = required(spec.model), required(spec.sac)
         self.setting, self.game = setting, GAMES[spec.method]
-        self.adversarial, self.training = used(spec.adversarial), used(spec.training)
-        self.curriculum = used(spec.curriculum)
+        self.adversarial, self.training = required(spec.adversarial), required(spec.training)
+        self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
-        self.label = checked_label(self.supervision) if self.supervision else None
+        self.label = None
+        if self.supervision:
+            self.label = checked_label(self.supervision, load_label(self.supervision.label))
         self.experts, self.generators, self.device = setting.experts, setting.generators, setting.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
         self.features = Features.of(model, self.experts.states)

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
 from ssmail.models.standards import Reach
@@ -20,8 +20,8 @@ class CloningLearner:
 
     def __init__(self, setting: Setting) -> None:
         spec = setting.spec
-        model = used(spec.model)
-        self.setting, self.cloning, self.training = setting, used(spec.cloning), used(spec.training)
+        model = required(spec.model)
+        self.setting, self.cloning, self.training = setting, required(spec.cloning), required(spec.training)
         self.generators, self.device = setting.generators, setting.device
         state_size, action_size = setting.experts.states.shape[-1], setting.experts.actions.shape[-1]
         features = Features.of(model, setting.experts.states)

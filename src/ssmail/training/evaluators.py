@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssmail.config.sections import used
+from ssmail.config.sections import required
 from ssmail.config.spec import RunSpec
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
@@ -239,7 +239,7 @@ class ForecastEvaluator(_Evaluator):
 
     def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
         super().__init__(spec, data, setting)
-        self.forecast = used(spec.forecast)
+        self.forecast = required(spec.forecast)
         self._check_windows()
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:

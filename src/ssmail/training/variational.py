@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import VariationalSpec, used
+from ssmail.config.sections import VariationalSpec, required
 from ssmail.envs.integrator import Integrator
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
@@ -190,8 +190,8 @@ class VariationalLearner:
 
     def __init__(self, setting: Setting) -> None:
         spec = setting.spec
-        self.setting, self.variational, self.cloning = setting, used(spec.variational), used(spec.cloning)
-        self.curriculum, self.training = used(spec.curriculum), used(spec.training)
+        self.setting, self.variational, self.cloning = setting, required(spec.variational), required(spec.cloning)
+        self.curriculum, self.training = required(spec.curriculum), required(spec.training)
         self.generators, self.device = setting.generators, setting.device
         features = Features.of(self.variational, setting.experts.states)
         state_size = setting.experts.states.shape[-1]

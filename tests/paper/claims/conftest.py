@@ -8,7 +8,7 @@ import pytest
 
 from ssmail.config.experiments import ablation_specs, build_spec, figure_requirements
 from ssmail.config.spec import RunSpec
-from ssmail.paper.collectors import COLLECTORS
+from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.store import RunState, Store
 
 AddRun = Callable[..., str]
@@ -46,7 +46,7 @@ def store_claim(add_run: AddRun) -> Callable[[str, Mapping[Any, Sequence[Mapping
 
     A group is a method, or a value of the ablation's key, as experiments.yaml says of the figure.
     """
-    figures = {collector.claim.name: collector.claim.figure for collector in COLLECTORS}
+    figures = {FIGURES[name].claim.name: name for name in CLAIMS}
 
     def add(claim: str, runs: Mapping[Any, Sequence[Mapping[str, Any]]]) -> None:
         needed = figure_requirements(figures[claim])

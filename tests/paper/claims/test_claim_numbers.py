@@ -5,8 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from ssmail.paper import c1_stability, c2_modes, c4_noise, c5_alpha, c6_curricula
-from ssmail.paper.curve_numbers import beginning, end, settled_after, slope
+from ssmail.paper.fig3_curricula import growth, largest_jump
+from ssmail.paper.fig4_stability import fluctuation, remaining_error
+from ssmail.paper.fig5_modes import share_between
+from ssmail.paper.fig7_noise import bending, late_slope, slope
+from ssmail.paper.fig8_alpha import common_level, epochs_to_converge
+from ssmail.paper.samples import beginning_mean, end_mean
 
 
 def curve(*values: float) -> np.ndarray:
@@ -15,38 +19,38 @@ def curve(*values: float) -> np.ndarray:
 
 def test_the_ends_of_a_curve_are_fifths() -> None:
     rising = np.arange(1.0, 12)
-    assert (beginning(rising), end(rising)) == (1.5, 10.5)
-    assert (beginning(curve(3, 4)), end(curve(3, 4))) == (3, 4)
-    assert end(curve(1, math.nan)) == math.inf
-    assert math.isnan(end(curve()))
+    assert (beginning_mean(rising), end_mean(rising)) == (1.5, 10.5)
+    assert (beginning_mean(curve(3, 4)), end_mean(curve(3, 4))) == (3, 4)
+    assert math.isnan(end_mean(curve(1, math.inf)))
+    assert math.isnan(end_mean(curve()))
 
 
 def test_a_slope_is_that_of_the_least_squares_line() -> None:
     values = curve(1, 4, 2, 8, 5)
     assert slope(values) == pytest.approx(np.polyfit(range(5), values, 1)[0])
-    assert slope(curve(1, math.inf, 2)) == math.inf
+    assert math.isnan(slope(curve(1, math.inf, 2)))
     assert math.isnan(slope(curve(1)))
 
 
 def test_when_an_error_has_settled() -> None:
-    assert settled_after(curve(5, 1, 3, 1, 1), 2) == 4
-    assert settled_after(curve(1, 1), 2) == 1
-    assert settled_after(curve(1, 3), 2) == math.inf
-    assert settled_after(curve(1, math.nan, 1), 2) == 3
+    assert epochs_to_converge(curve(5, 1, 3, 1, 1), 2) == 4
+    assert epochs_to_converge(curve(1, 1), 2) == 1
+    assert epochs_to_converge(curve(1, 3), 2) == math.inf
+    assert epochs_to_converge(curve(1, math.nan, 1), 2) == 3
 
 
 def test_c1_what_is_left_of_the_error() -> None:
-    assert c1_stability.remaining_error(curve(9, 2), curve(9, 3), 10) == 0.3
-    assert c1_stability.remaining_error(curve(9, 4), curve(9, 3), 10) == 0.4
-    assert math.isnan(c1_stability.remaining_error(curve(9, 4), curve(), 10))
+    assert remaining_error(curve(9, 2), curve(9, 3), curve(10)) == 0.3
+    assert remaining_error(curve(9, 4), curve(9, 3), curve(10)) == 0.4
+    assert math.isnan(remaining_error(curve(9, 4), curve(), curve(10)))
 
 
 def test_c1_fluctuation_looks_at_ratios_of_the_second_half() -> None:
-    assert c1_stability.fluctuation(curve(9, 1, 2, 1)) == pytest.approx(math.log(2))
-    assert c1_stability.fluctuation(1000 * curve(9, 1, 2, 1)) == pytest.approx(math.log(2))
-    assert c1_stability.fluctuation(curve(1, 1, math.inf)) == math.inf
-    assert math.isnan(c1_stability.fluctuation(curve(1)))
-    assert c1_stability.fluctuation(curve(1, 0, 0)) == 0
+    assert fluctuation(curve(9, 1, 2, 1)) == pytest.approx(math.log(2))
+    assert fluctuation(1000 * curve(9, 1, 2, 1)) == pytest.approx(math.log(2))
+    assert math.isnan(fluctuation(curve(1, 1, math.inf)))
+    assert math.isnan(fluctuation(curve(1)))
+    assert fluctuation(curve(1, 0, 0)) == 0
 
 
 def test_c2_who_ends_between_the_lanes() -> None:
@@ -55,26 +59,26 @@ def test_c2_who_ends_between_the_lanes() -> None:
     rollouts = np.zeros((1, 1, 2, 4, 2))
     rollouts[0, 0, -1, :, 1] = [0.0, 1.9, 2.1, -9.0]
     rollouts[0, 0, -1, :, 0] = 7.0  # too far along, which is not sideways
-    assert c2_modes.between(rollouts, lanes) == 0.5
+    assert share_between(rollouts, lanes) == 0.5
     rollouts[0, 0, -1, 0, 1] = math.nan
-    assert c2_modes.between(rollouts, lanes) == 0.25
+    assert share_between(rollouts, lanes) == 0.25
 
 
 def test_c4_an_error_that_grows_ever_more_slowly() -> None:
     steps = np.arange(1.0, 9)
-    assert c4_noise.bending(np.sqrt(steps)) < 0 < c4_noise.bending(steps**2)
-    assert c4_noise.bending(3 * steps) == pytest.approx(0)
-    assert c4_noise.late_slope(curve(9, 9, 1, 3)) == 2
-    assert c4_noise.bending(np.full(8, math.inf)) == math.inf
+    assert bending(np.sqrt(steps)) < 0 < bending(steps**2)
+    assert bending(3 * steps) == pytest.approx(0)
+    assert late_slope(curve(9, 9, 1, 3)) == pytest.approx(2)
+    assert math.isnan(bending(np.full(8, math.inf)))
 
 
 def test_c5_the_level_belongs_to_no_range() -> None:
-    assert c5_alpha.common_level([1, 2, 3, math.inf]) == 4
-    assert math.isnan(c5_alpha.common_level([math.inf]))
-    assert c5_alpha.epochs_to_converge(curve(5, 1), math.nan) == math.inf
+    assert common_level([1, 2, 3, math.inf]) == 4
+    assert math.isnan(common_level([math.inf]))
+    assert epochs_to_converge(curve(5, 1), math.nan) == math.inf
 
 
 def test_c6_growth_and_the_largest_jump() -> None:
-    assert c6_curricula.growth(curve(2, 3, 5)) == 2.5
-    assert c6_curricula.largest_jump(curve(1, 2, 5)) == 0.75
-    assert math.isnan(c6_curricula.largest_jump(curve(1, 1)))
+    assert growth(curve(2, 3, 5)) == 2.5
+    assert largest_jump(curve(1, 2, 5)) == 0.75
+    assert math.isnan(largest_jump(curve(1, 1)))

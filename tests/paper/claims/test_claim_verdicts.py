@@ -7,7 +7,7 @@ import pytest
 
 from ssmail.evaluation.order_statistics import ALPHA, UNKNOWN, deviations, rank_test
 from ssmail.paper.claims import Decision, Part, Sample, Verdict, holm
-from ssmail.paper.statements import every, smaller, steadier, typical
+from ssmail.paper.hypotheses import every_seed, less_spread, median_seed, smaller
 
 
 def sample(*values: float, label: str = "ssail") -> Sample:
@@ -57,17 +57,17 @@ def test_holm_by_hand() -> None:
 
 
 def test_every_seed_has_to() -> None:
-    assert every("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
-    four = every("", "", sample(1, 2, 3, 4), "below", 6)
+    assert every_seed("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
+    four = every_seed("", "", sample(1, 2, 3, 4), "below", 6)
     assert (four.verdict, four.p_for, four.more_seeds) == (Verdict.INCONCLUSIVE, 1 / 16, 1)
-    assert every("", "", sample(1, 2, 3, 4, math.inf), "below", 6).verdict is Verdict.CONTRADICTED
-    assert every("", "", sample(6, 7), "above", 6).verdict is Verdict.CONTRADICTED  # at the bar is not above it
+    assert every_seed("", "", sample(1, 2, 3, 4, math.inf), "below", 6).verdict is Verdict.CONTRADICTED
+    assert every_seed("", "", sample(6, 7), "above", 6).verdict is Verdict.CONTRADICTED  # at the bar is not above it
 
 
 def test_the_typical_seed_has_to() -> None:
-    assert typical("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
-    assert typical("", "", sample(1, 2, 3, 4, 5), "above", 6).verdict is Verdict.CONTRADICTED
-    four = typical("", "", sample(1, 2, 3, 4, math.inf), "below", 6)
+    assert median_seed("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
+    assert median_seed("", "", sample(1, 2, 3, 4, 5), "above", 6).verdict is Verdict.CONTRADICTED
+    four = median_seed("", "", sample(1, 2, 3, 4, math.inf), "below", 6)
     assert (four.verdict, four.effect_is) == (Verdict.INCONCLUSIVE, "median (4 of 5 seeds below 6)")
     assert four.more_seeds == 13  # 18 in all: P(X >= 13 | 18, 0.8) = 0.87, and P(X >= 13 | 18, 1/2) = 0.048
 
@@ -83,11 +83,11 @@ def test_one_group_has_smaller_values() -> None:
 
 def test_one_group_spreads_less() -> None:
     tight, wide = sample(10, 10.1, 10.2, 10.3, 10.4), sample(1, 3, 6, 8, 11)
-    assert steadier("", "", tight, wide).verdict is Verdict.SUPPORTED  # whichever is greater
-    assert steadier("", "", wide, tight).verdict is Verdict.CONTRADICTED
-    alike = steadier("", "", tight, sample(1, 1.1, 1.2, 1.3, 1.4))
+    assert less_spread("", "", tight, wide).verdict is Verdict.SUPPORTED  # whichever is greater
+    assert less_spread("", "", wide, tight).verdict is Verdict.CONTRADICTED
+    alike = less_spread("", "", tight, sample(1, 1.1, 1.2, 1.3, 1.4))
     assert (alike.verdict, alike.seeds) == (Verdict.INCONCLUSIVE, None)
-    assert "too few" in steadier("", "", sample(1), wide).reason
+    assert "too few" in less_spread("", "", sample(1), wide).reason
 
 
 @pytest.mark.parametrize("draw", ["normal", "lognormal", "uniform"])
@@ -102,4 +102,4 @@ def test_what_is_missing_is_told() -> None:
     nothing = smaller("", "", Sample("ssail"), Sample("gail"))
     assert nothing.reason == "no runs of ssail; no runs of gail"
     assert (nothing.verdict, nothing.more_seeds) == (Verdict.INCONCLUSIVE, None)
-    assert typical("", "", sample(1, math.nan, math.nan), "below", 3).reason == "unknown for seeds 1, 2 of ssail"
+    assert median_seed("", "", sample(1, math.nan, math.nan), "below", 3).reason == "unknown for seeds 1, 2 of ssail"

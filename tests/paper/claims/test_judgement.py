@@ -10,8 +10,8 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.experiments_file import load_experiments
 from ssmail.errors import InputError
 from ssmail.paper.claims import Part, Verdict
-from ssmail.paper.collectors import COLLECTORS
 from ssmail.paper.judgement import Judgement, judge
+from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.store import RunState, Store
 
 from .scenarios import SCENARIOS
@@ -35,9 +35,10 @@ def part(found: Judgement, words: str) -> Part:
 
 
 def test_the_claims_are_eight_and_each_has_its_figure() -> None:
-    assert [collector.claim.name for collector in COLLECTORS] == list(SCENARIOS)
-    figures = {collector.claim.figure for collector in COLLECTORS}
-    assert figures == {f"fig{n}" for n in range(1, 9)} <= set(load_experiments().figures)
+    claims = [FIGURES[name].claim for name in CLAIMS]
+    assert [claim.name for claim in claims] == list(SCENARIOS)
+    assert [claim.figure for claim in claims] == list(CLAIMS)
+    assert set(CLAIMS) == {f"fig{n}" for n in range(1, 9)} <= set(load_experiments().figures)
 
 
 @pytest.mark.parametrize("case", VERDICTS)
@@ -75,6 +76,25 @@ def test_a_diverged_run_did_not_converge_and_fluctuates_most(store: Store, store
     assert converges.verdict is Verdict.CONTRADICTED
     assert part(found, "gail fluctuates").samples[1].values[0] == np.inf
     assert part(found, "gail does not converge").verdict is Verdict.SUPPORTED
+
+
+def test_a_finished_run_without_a_finite_number_counts_as_diverged(store: Store, store_claim: StoreClaim) -> None:
+    runs = {claim: {name: list(seeds) for name, seeds in SCENARIOS[claim]("true").items()} for claim in ("C1", "C4")}
+    broken = {"train/mode_mse": [0.1, np.inf, 0.1, np.nan], "validation/mode_mse": [0.1] * 4}
+    runs["C1"]["ssail"][1] = runs["C1"]["ssail"][1] | {"epochs": broken}
+    errors = {"test_noisy/mse": np.array([1.0, 2.0, 3.0, np.inf])}
+    runs["C4"]["ssail"][2] = {"arrays": errors}
+    runs["C4"]["dnri"][3] = {"arrays": {"test_noisy/mse": np.array([0.1])}}
+    for claim, found in runs.items():
+        store_claim(claim, found)
+    c1, c4 = judged(store, "C1"), judged(store, "C4")
+    assert part(c1, "ssail converges").samples[0].values[1] == np.inf
+    assert part(c1, "gail fluctuates").samples[0].values[1] == np.inf
+    assert part(c4, "slope falls").samples[0].values[2] == np.inf
+    late, late_dnri = part(c4, "more slowly").samples
+    assert late.values[2] == np.inf
+    assert np.isnan(late_dnri.values[3])  # one step has no slope: unknown, not diverged
+    assert part(c4, "spread grows").reason == "unknown for seed 3 of dnri"
 
 
 @pytest.mark.parametrize(

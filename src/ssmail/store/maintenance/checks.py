@@ -8,7 +8,7 @@ from pathlib import Path
 from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import DBAPIError
 
-from ssmail.config.spec import hash_of
+from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError
 from ssmail.store import arrays, lifecycle, queries, schema
 from ssmail.store.checkpoint_files import STAGING, fault, root_of
@@ -91,7 +91,7 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
 def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
     """The hash must be that of the spec."""
     try:
-        found = hash_of(run.spec)
+        found = spec_hash(run.spec)
     except (ValueError, TypeError, AttributeError):  # no JSON, or not that of a spec
         found = None
     if found != run.spec_hash:

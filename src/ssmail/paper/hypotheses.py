@@ -28,7 +28,7 @@ class _Tested(NamedTuple):
     seeds: int | None
 
 
-def every(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
+def every_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
     """Every seed of a method is below (above) the bar: one counterexample contradicts it.
 
     n of n seeds support it once they rule out that half of all seeds, or fewer, are: p = 2 ** -n, from five seeds on.
@@ -43,7 +43,7 @@ def every(statement: str, statistic: str, sample: Sample, side: Side, bar: float
     return _part(statement, statistic, test, (sample,), tested)
 
 
-def typical(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
+def median_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
     """The median over all seeds of a method is below (above) the bar: sign test."""
 
     def tested() -> _Tested:
@@ -67,7 +67,7 @@ def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Par
     return _part(statement, statistic, "exact rank test (Wilcoxon, Mann, Whitney)", (small, great), tested)
 
 
-def steadier(statement: str, statistic: str, tight: Sample, wide: Sample) -> Part:
+def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> Part:
     """Runs of `tight` spread less than those of `wide`: rank test of the distances from each group's own median.
 
     It is Brown and Forsythe's test on ranks, without the structural zero of each group. The distances of one group are
