@@ -128,7 +128,6 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.execution.planning import figure_cells
 
     listed = load_experiments().figures
     choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}
@@ -137,6 +136,18 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
         if name not in choices:
             raise unknown_name("figure", name, choices)
     return {name: figure_cells(name, profile, seeds) for name in dict.fromkeys(choices[name] for name in wanted)}
+
+
+def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
+    """The cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
+    from ssmail.execution.cells import Cell
+    from ssmail.plots.series import figure_specs
+
+    return {
+        Cell(spec, seed): {**names, "seed": seed}
+        for spec, names in figure_specs(figure, profile).items()
+        for seed in seeds
+    }
 
 
 def _merged(sweeps: "Iterable[Sweep]") -> Sweep:

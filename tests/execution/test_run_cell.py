@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.data.expert_file import save
+from ssmail.data.expert_sets import save
 from ssmail.data.yjunction import generate
 from ssmail.execution import Resume
 from ssmail.execution import run_cell as module

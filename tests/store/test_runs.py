@@ -82,7 +82,7 @@ def test_no_metrics_still_give_typed_columns(store: Store, writer: RunWriter) ->
 
 def test_a_step_is_recorded_once(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
-    with pytest.raises(SsmailError, match="already has metrics of step 1"):
+    with pytest.raises(SsmailError, match="already has metrics for step 1"):
         writer.epoch(1, {"b": 5.0, "a": 2.0})
     assert values(store, writer.run_id) == {("a", 1): 1.0}  # and nothing of the refused step
 
@@ -143,7 +143,7 @@ def test_resuming_drops_what_came_after_the_checkpoint(store: Store, writer: Run
 def test_a_checkpoint_ahead_of_the_database_is_refused(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
     writer.finish(RunState.INTERRUPTED)
-    with pytest.raises(SsmailError, match=r"checkpoint of run .* is at epoch 2 but the database ends at 1"):
+    with pytest.raises(SsmailError, match=r"checkpoint of run .* is at epoch 2 but the database ends at epoch 1"):
         store.resume_run(writer.run_id, 2)
     assert only(store).state is RunState.INTERRUPTED
     store.resume_run(writer.run_id, 1)
@@ -191,7 +191,7 @@ def test_who_lost_the_run_to_another_process_writes_no_more(store: Store, writer
 
 
 def test_a_running_cell_is_refused_until_it_falls_silent(store: Store, spec: RunSpec, writer: RunWriter) -> None:
-    sentence = r"seed 0 of this spec is being computed by another process on .*; wait for it, or"
+    sentence = r"seed 0 of this spec is being computed by another process on .*; wait for it to end, or"
     for attempt in (
         lambda: store.start_run(spec, 0, dataset_hash=None, device="cpu", repeat=True),
         lambda: store.resume_run(writer.run_id, 0),

@@ -6,10 +6,9 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from ssmail.config.experiments import ablation, ablation_specs, build_spec, figure_requirements
 from ssmail.config.spec import RunSpec
 from ssmail.config.user_functions import load_label
-from ssmail.data.expert_file import load
+from ssmail.data.expert_sets import load
 from ssmail.errors import InputError
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event
@@ -63,23 +62,6 @@ def _check_data(cell: Cell, row: RunRow) -> None:
     path = cell.spec.data.path
     if path is not None and load(Path(path), cell.spec.environment).hash != row.dataset_hash:
         raise InputError(f"{path} has changed since run {row.name} was trained on it; train again with --resume never")
-
-
-def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> dict[Cell, dict[str, Any]]:
-    """Return the cells that `figure` ("fig4") draws, each with its method, ablated key and seed for display.
-
-    Raises InputError for an unknown figure or profile.
-    """
-    needed = figure_requirements(figure)
-    specs: list[tuple[RunSpec, dict[str, Any]]] = []
-    if needed.ablation is None:
-        for method in needed.methods:
-            specs.append((build_spec(method, needed.environment, profile), {"method": method}))
-    else:
-        varied = ablation(needed.ablation, needed.environment)
-        for value, spec in ablation_specs(varied.name, profile, environment=varied.environment).items():
-            specs.append((spec, {"method": varied.method, varied.key: display_value(value)}))
-    return {Cell(spec, seed): {**names, "seed": seed} for spec, names in specs for seed in seeds}
 
 
 def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[RunSpec, float | None]:

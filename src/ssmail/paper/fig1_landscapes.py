@@ -36,7 +36,8 @@ from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig1"
@@ -121,7 +122,7 @@ class LandscapesRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> LandscapesRecord:
-    """The runs that `ssmail.plots.selection` chooses, or those of the given ids.
+    """The runs that `ssmail.plots.series` chooses, or those of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without landscapes.
     """

@@ -32,7 +32,7 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
 from ssmail.plots.curves import Band, band, silent
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import select
+from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig4"
@@ -83,7 +83,7 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> StabilityRecord:
-    """The training errors of the runs that `ssmail.plots.selection` chooses, or of the given ids.
+    """The training errors of the runs that `ssmail.plots.series` chooses, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without training errors.
     """

@@ -31,7 +31,8 @@ from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig5"
@@ -105,7 +106,7 @@ class ModesRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
-    """The test rollouts of the runs that `ssmail.plots.selection` chooses, or of the given ids.
+    """The test rollouts of the runs that `ssmail.plots.series` chooses, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
     """

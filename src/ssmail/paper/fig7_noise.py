@@ -43,7 +43,8 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig7"
@@ -155,7 +156,7 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> NoiseRecord:
-    """The test errors of the runs that `ssmail.plots.selection` chooses, or of the given ids.
+    """The test errors of the runs that `ssmail.plots.series` chooses, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id, a run without test errors and runs that
     were tested in different ways.
