@@ -38,6 +38,7 @@ from ssmail.plots.formatting import setting
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.selection import Selection
 from ssmail.store import RunRow, RunState, Store
+from ssmail.store.comparison import latest_values
 
 NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
@@ -182,9 +183,7 @@ def median_of(measured: Sequence[Measured]) -> Measured:
 
 
 def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
-    latest = store.latest_metrics([run.id for run in selection.runs], names=[BEHIND, AHEAD])
-    keys = zip(latest["run_id"].tolist(), latest["name"].tolist(), strict=True)
-    values = dict(zip(keys, latest["value"].tolist(), strict=True))
+    values = latest_values(store, selection.runs, [BEHIND, AHEAD])
     found = []
     for group in selection.groups:
         for run in group.runs:

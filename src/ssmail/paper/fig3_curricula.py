@@ -20,14 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import LEAST, WORST, Floats, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.ablation_selection import select_ablation
-from ssmail.plots.curves import Band, Curve, band, silent
+from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.selection import Group
 from ssmail.store import Store
@@ -83,9 +82,7 @@ def collect(
     selection = select_ablation(store, NAME, runs, profile)
     values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
     measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
-    for group in selection.groups:
-        for run in silent(group, measured):
-            raise InputError(f"run {run.name} ({run.state}) has no {MEASURED}; leave it out or train it again.")
+    check_recorded(selection.groups, MEASURED, measured)
     return CurriculaRecord(
         bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
         expected=tuple(_longest(group, expected, statistic) for group in selection.groups),

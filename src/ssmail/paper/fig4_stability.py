@@ -23,14 +23,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
 from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
-from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.selection import select
 from ssmail.store import Store
@@ -89,9 +88,7 @@ def collect(
     """
     selection = select(store, NAME, runs, profile)
     errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
-    for group in selection.groups:
-        for run in silent(group, errors):
-            raise InputError(f"run {run.name} ({run.state}) has no {METRIC} yet; leave it out or train it further.")
+    check_recorded(selection.groups, METRIC, errors)
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
     return StabilityRecord(
         bands=bands,

@@ -33,6 +33,7 @@ from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.selection import Selection, select
 from ssmail.store import RunRow, RunState, Store
+from ssmail.store.comparison import latest_values
 
 NAME = "fig5"
 STARTS = 16
@@ -162,9 +163,7 @@ def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
 
 
 def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
-    metrics = store.latest_metrics([run.id for run in selection.runs], names=[ON_LANE, LANE_BALANCE])
-    keys = zip(metrics["run_id"].tolist(), metrics["name"].tolist(), strict=True)
-    values: dict[tuple[str, str], float] = dict(zip(keys, metrics["value"].tolist(), strict=True))
+    values = latest_values(store, selection.runs, [ON_LANE, LANE_BALANCE])
     return tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
 
 

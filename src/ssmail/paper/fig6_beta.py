@@ -14,7 +14,7 @@ the paper's and fixed beforehand, because the best of several would win by luck 
 difference counts that cannot be chance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,6 @@ from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.selection import Group
 from ssmail.store import Store
-from ssmail.store.comparison import latest_values
 
 NAME = "fig6"
 ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
@@ -114,8 +113,7 @@ def collect(
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
     selection = select_ablation(store, NAME, runs, profile)
-    values = latest_values(store, selection.runs, [ERROR, BALANCE])
-    columns = tuple(_column(group, values, statistic) for group in selection.groups)
+    columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,
         statistic=statistic,
@@ -125,15 +123,12 @@ def collect(
     )
 
 
-def _column(group: Group, values: Mapping[tuple[str, str], float], statistic: Statistic) -> Column:
+def _column(runs: Runs, group: Group, statistic: Statistic) -> Column:
     for run in group.runs:
         if not run.state.settled:
             raise InputError(f"run {run.name} ({run.state}) has no test error; leave it out or train it to its end.")
-    error, balance = (
-        np.array([values.get((run.id, name), np.nan) for run in group.runs], dtype=np.float64)
-        for name in (ERROR, BALANCE)
-    )
-    error = np.where(np.isfinite(error), error, np.inf)
+    error = np.array(runs.metric(group.value, ERROR, diverged=WORST).values)
+    balance = np.array(runs.metric(group.value, BALANCE, diverged=np.nan).values)
     return Column(
         label=group.label,
         value=group.value,
@@ -214,8 +209,8 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
         points.set_gid(f"runs-{column.label}")
         if column.diverged:
             top = np.full(column.diverged, axes.get_ylim()[1])
-            style.draw_cross(axes, x[~finite], top, CROSSES).set_gid(f"diverged-{column.label}")
-    lowest = np.array([column.error.min() for column in record.columns])
+            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(f"diverged-{column.label}")
+    lowest = np.array([np.fmin.reduce(column.error) for column in record.columns])
     summary = _over_columns([column.error_summary for column in record.columns])
     line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
     line.set_label(record.statistic.words)

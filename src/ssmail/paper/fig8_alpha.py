@@ -28,7 +28,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
@@ -36,7 +35,7 @@ from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.constant_velocity import constant_velocity
-from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
@@ -131,9 +130,7 @@ def _bands(
     """Of the sum of the metrics, epoch by epoch; unknown where one of them is."""
     values = store.metrics([run.id for run in selection.runs], names=metrics)
     for metric in metrics:
-        for group in selection.groups:
-            for run in silent(group, values[values["name"] == metric]):
-                raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
+        check_recorded(selection.groups, metric, values[values["name"] == metric])
     wide = values.pivot(index=["run_id", "step"], columns="name", values="value")
     summed = wide.sum(axis="columns", skipna=False).rename("value").reset_index()
     return tuple(band(group, name, summed, statistic) for group in selection.groups)

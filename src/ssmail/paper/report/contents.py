@@ -66,10 +66,6 @@ class Report:
         """Every run by its full id."""
         return {run.id: run for run in self.runs}
 
-    def distinct(self, column: str) -> list[Any]:
-        """The values that a column of the runs has, each once and sorted."""
-        return sorted({getattr(run, column) for run in self.runs if getattr(run, column) is not None})
-
 
 def gather(
     store: Store,
@@ -110,9 +106,3 @@ def samples_of(found: Judgement) -> list[tuple[Part, Sample]]:
         for sample in part.samples:
             seen.setdefault((part.statistic, sample.label), (part, sample))
     return list(seen.values())
-
-
-def code_of(run: RunRow) -> str:
-    """ "0.1.0+703fd585", with "-dirty" where the files had been changed."""
-    commit = f"+{run.git_commit[:8]}" if run.git_commit else ""
-    return f"{run.package_version}{commit}{'-dirty' if run.git_dirty else ''}"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES, save
+from ssmail.plots import provenance
 from ssmail.plots.provenance import Provenance
 from ssmail.store import Store
 
@@ -66,13 +67,10 @@ def draw(
 ) -> Drawn:
     """Collect, draw and save the figure `name` ("fig4") of these runs (ids), or of those that it chooses by itself.
 
-    Raises what the figure's `collect` and `ssmail.figures.save` raise.
+    Raises what the figure's `collect` and `ssmail.paper.results.save` raise.
     """
-    from ssmail.plots.saving import embedded
-
     module = FIGURES[name]
     record = module.collect(store, runs, profile=profile, statistic=statistic)
     figure = module.draw(record)
     files = save(name, record, figure, out, formats)
-    provenance = embedded(record, files[-1].read_text(encoding="utf-8"))
-    return Drawn(module.name, tuple(files), figure, provenance, record.notes)
+    return Drawn(module.name, tuple(files), figure, provenance.read(files[0]), record.notes)

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from ssmail import __version__
 from ssmail.errors import InputError
 from ssmail.paper.claims import Verdict
-from ssmail.paper.report.contents import Report, code_of, samples_of
+from ssmail.paper.report.contents import Report, samples_of
 from ssmail.paper.report.drawing import Drawn
 from ssmail.plots import formatting
 from ssmail.store import RunRow
@@ -75,7 +75,8 @@ def _environment(autoescape: bool) -> Environment:
         "base64": lambda data: b64encode(data).decode("ascii"),
         "sign": SIGNS.__getitem__,
         "cell": lambda text: str(text).replace("|", "\\|").replace("\n", " "),
-        "code": code_of,
+        "code": formatting.short_code,
+        "distinct": lambda values: sorted({value for value in values if value is not None}),
         "samples": samples_of,
         "differences": _differences,
         "whole": _whole,
