@@ -7,9 +7,7 @@ and for each split `positions`, `velocities` and `mode`. A yjunction set holds i
 training split, and the checksums of its `sources`. Nothing in it is pickled.
 """
 
-import contextlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -21,6 +19,7 @@ from pydantic import ValidationError
 
 from ssmail.config.sections import LettersSpec, YJunctionSpec
 from ssmail.data import letters
+from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.data.yjunction import LANES, make_expert_set
@@ -92,22 +91,17 @@ def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
         arrays |= _mocap_arrays(experts)
     else:
         arrays["centre_lines"] = experts.centre_lines
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(  # compressed, such numbers are hardly smaller
-            temporary,
-            allow_pickle=False,
-            **arrays,
-            parameters=np.array(json.dumps(experts.parameters)),
-            hash=np.array(experts.hash),
-        )
-        temporary.replace(path)
+        with atomic_write(path) as partial, partial.open("wb") as file:
+            np.savez(  # compressed, such numbers are hardly smaller
+                file,
+                allow_pickle=False,
+                **arrays,
+                parameters=np.array(json.dumps(experts.parameters)),
+                hash=np.array(experts.hash),
+            )
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}; choose a writable --out") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def load(path: Path, environment: str | None = None) -> ExpertSet:

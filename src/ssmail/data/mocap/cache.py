@@ -15,6 +15,7 @@ from pathlib import Path
 from pydantic import Field, ValidationError
 
 from ssmail.config.sections import Frozen
+from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError, SsmailError
 
 RECORD = "downloads.json"
@@ -112,12 +113,8 @@ class Cache:
 
     def _save(self, whole: dict[str, Whole], partial: dict[str, Partial]) -> None:
         self._record = Record(whole=whole, partial=partial)
-        temporary = self.folder / f"{RECORD}.new"
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(self._record.model_dump_json(indent=2) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(self.folder / RECORD)
+        with atomic_write(self.folder / RECORD) as path:
+            path.write_text(self._record.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
 
 @contextmanager
