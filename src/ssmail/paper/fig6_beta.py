@@ -1,17 +1,18 @@
 """Figure 6 (section 4.5): the test error on Y-Junction against beta, the pace of trajectory forcing.
 
-The error is `test/mode_mse` of the best-validation model: the position MSE to the nearer of the expert's lanes, squared
-scaled units, on a logarithmic scale. Below it `test/lane_balance`, the share of the rarer lane, because a policy that
-takes one lane alone can have a low error. Each seed is a point; beside them stand centre and spread over **all** runs
-of that beta (`ssmail.evaluation.statistics`). A diverged run has no test error: it counts as infinite, is a cross at
-the top edge and takes the mean with it; its lane balance is unknown, and takes the centre there with it. The values of
-beta are evenly spaced, because those of interest crowd near 0. The dotted line is constant velocity.
+The error is `test/mode_mse` of the best-validation model: the position MSE to the nearer of the expert's lanes, in
+squared scaled units, on a logarithmic scale. Below it is `test/lane_balance`, the share of the rarer lane, because a
+policy that only ever takes one lane can have a low error. Points are seeds; beside them are centre and spread over
+**all** runs of that beta (`ssmail.evaluation.statistics`). A diverged run has no test error: it counts as infinite, is
+a cross at the top edge, and leaves the mean undefined. Its lane balance is unknown, which leaves both centres
+undefined. The values of beta are evenly spaced, because those of interest crowd near 0. The dotted line is constant
+velocity.
 
-Deviation: the paper shows mean and standard deviation alone.
+Deviation: the paper shows only mean and standard deviation.
 
-Claim C3: a beta of about 15 % has a low mean and a low spread; 0 % has both high, 100 % the spread. The value 0.15 is
-the paper's and fixed beforehand, because the best of several would win by luck alone. "Considerably" is left out: any
-difference counts that cannot be chance.
+Claim C3: a beta of about 15 % has a low mean and a low spread; with 0 % both are high, with 100 % the spread is. The
+value 0.15 is the paper's and was fixed beforehand, because the best of several values would win by luck alone.
+"Considerably" is left out: any difference counts that cannot be chance.
 """
 
 from collections.abc import Sequence
@@ -47,8 +48,8 @@ CLAIM = Claim(
 )
 NONE, CHOSEN, COMPLETE = 0.0, 0.15, 1.0  # values of beta
 ERROR_STATISTIC = f"{ERROR} of the model of best validation, squared scaled units"
-SPREAD = 0.17  # of the distance between two values of beta: how far the points of one stand apart
-ASIDE = 0.26  # how far right of them their centre stands
+SPREAD = 0.17  # of the points of one beta, as a share of the distance between two values
+ASIDE = 0.26  # distance of the centre to the right of them, likewise
 
 POINTS, CROSSES = style.METHODS["ssail"].colour, style.METHODS["gail"].colour
 
@@ -63,18 +64,18 @@ class Column:
     seeds: tuple[int, ...]
     error: Floats  # (R,) squared scaled units; +inf when the run diverged or its error is not finite, NaN if unknown
     balance: Floats  # (R,) 0..0.5; NaN when it is unknown
-    error_summary: Summary  # each a number
+    error_summary: Summary  # of floats
     balance_summary: Summary
 
     @property
     def diverged(self) -> int:
-        """How many runs have no finite error."""
+        """The number of runs without a finite error."""
         return int(np.isposinf(self.error).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class BetaRecord:
-    """Everything that figure 6 shows."""
+    """The contents of figure 6."""
 
     columns: tuple[Column, ...]  # beta rising
     statistic: Statistic
@@ -85,8 +86,8 @@ class BetaRecord:
     def table(self) -> pd.DataFrame:
         """[kind, beta, run_id, seed, mode_mse, mode_mse_low, mode_mse_high, lane_balance, ..._low, ..._high].
 
-        kind: run, mean or median (with the ends of both spreads), or constant velocity. A diverged run has mode_mse
-        inf.
+        kind: run, mean or median (with the ends of both spreads), or constant velocity. mode_mse is inf for a diverged
+        run.
         """
         rows: list[tuple[object, ...]] = []
         nothing = (np.nan, np.nan)
@@ -108,7 +109,7 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> BetaRecord:
-    """The test results of the runs that `ssmail.plots.ablation_selection` chooses, or of the given ids.
+    """Collect the test results of the runs that the figure draws by default, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
@@ -165,7 +166,7 @@ def decide(none: Sample, chosen: Sample, complete: Sample) -> tuple[Part, ...]:
 
 
 def draw(record: BetaRecord) -> Figure:
-    """The error above, the lane balance below it, over evenly spaced values of beta. The legend stands above."""
+    """Draw the error above the lane balance, over evenly spaced values of beta, with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=3.3)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
@@ -186,7 +187,7 @@ def draw(record: BetaRecord) -> Figure:
 
 
 def _short(label: str) -> str:
-    """0.05 -> .05, to fit beside its neighbours."""
+    """Shorten "0.05" to ".05", to fit beside its neighbours."""
     return label.removeprefix("0") if label.startswith("0.") else label
 
 
@@ -197,7 +198,7 @@ def _limits(record: BetaRecord) -> tuple[float, float]:
 
 
 def _places(index: int, count: int) -> Floats:
-    """Where the points of one value of beta stand, by seed, left of its centre."""
+    """The x positions of the points of one value of beta, left of its centre."""
     return index + np.linspace(-SPREAD, SPREAD, count) * (count > 1) - ASIDE / 2
 
 
@@ -230,12 +231,12 @@ def _draw_balances(axes: Axes, record: BetaRecord) -> None:
 
 
 def _over_columns(summaries: Sequence[Summary]) -> Summary:
-    """Numbers for each of C columns -> three times (C,)."""
+    """Stack the summaries of C columns into one of three (C,) arrays."""
     return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:
-    """A bar from low to high for each column, where they are finite, and the centres joined by a line."""
+    """Draw a bar from low to high for each column, where they are finite, and join the centres by a line."""
     x = np.arange(len(summary.centre)) + ASIDE
     centre = np.where(np.isfinite(summary.centre), summary.centre, np.nan)
     high = np.where(np.isposinf(summary.high), axes.get_ylim()[1], summary.high)
