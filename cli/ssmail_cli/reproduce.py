@@ -74,7 +74,7 @@ def reproduce(
     paths of the files. Exit code 3: some runs did not finish, or figures were left out.
     """
     from ssmail.execution.cells import check_labels
-    from ssmail.execution.figure_cells import longest_first
+    from ssmail.execution.durations import longest_first
     from ssmail.store import Store
 
     given = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
@@ -128,7 +128,6 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.execution.figure_cells import figure_cells
 
     listed = load_experiments().figures
     choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}
@@ -137,6 +136,18 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
         if name not in choices:
             raise unknown_name("figure", name, choices)
     return {name: figure_cells(name, profile, seeds) for name in dict.fromkeys(choices[name] for name in wanted)}
+
+
+def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
+    """The cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
+    from ssmail.execution.local import Cell
+    from ssmail.plots.series import figure_specs
+
+    return {
+        Cell(spec, seed): {**names, "seed": seed}
+        for spec, names in figure_specs(figure, profile).items()
+        for seed in seeds
+    }
 
 
 def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
@@ -150,7 +161,7 @@ def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
 
 def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
     """How long a run of each spec takes, as far as the stored runs tell."""
-    from ssmail.execution.figure_cells import estimated_seconds
+    from ssmail.execution.durations import estimated_seconds
     from ssmail.store import Store
 
     runs = [] if is_missing(db) else Store.open(db).runs(state="finished")
@@ -192,7 +203,7 @@ def _stored(sweep: Sweep, data: DataFiles, db: str) -> "set[Cell]":
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     """The estimate of the runs of these seconds, `jobs` at a time: as a number (None: unknown) and in words."""
-    from ssmail.execution.figure_cells import total_seconds
+    from ssmail.execution.durations import total_seconds
 
     known = [value for value in each if value is not None]
     total = total_seconds(known, jobs)

@@ -39,7 +39,8 @@ from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig1"

@@ -25,7 +25,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.experiments import ablation, display_value, figure_requirements
+from ssmail.config.experiments import display_value
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import cosines
@@ -33,10 +33,10 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.formatting import setting
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import figure_ablation, select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
@@ -145,7 +145,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without a vector field.
     """
-    selection = select_ablation(store, NAME, runs, profile)
+    selection = select(store, NAME, runs, profile)
     selection = selection if runs else _of_the_paper(selection)
     measured = _measured(store, selection)
     chosen = [median_of([one for one in measured if one.label == group.label]) for group in selection.groups]
@@ -162,8 +162,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
 
 def _of_the_paper(selection: Selection) -> Selection:
     """Leave out ranges that the ablation of experiments.yaml does not list, such as that of figure 1."""
-    entry = figure_requirements(NAME)
-    values = ablation(str(entry.ablation), entry.environment).values
+    values = figure_ablation(NAME).values
     groups = tuple(group for group in selection.groups if group.value in values)
     others = [group.label for group in selection.groups if group.value not in values]
     if not groups or not others:

@@ -26,10 +26,10 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import LEAST, WORST, Floats, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Group
+from ssmail.plots.run_groups import Group
+from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig3"
@@ -80,7 +80,7 @@ def collect(
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run that stored no segment lengths.
     """
-    selection = select_ablation(store, NAME, runs, profile)
+    selection = select(store, NAME, runs, profile)
     values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
     measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
     check_recorded(selection.groups, MEASURED, measured)

@@ -31,7 +31,7 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
 from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import select
+from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig4"

@@ -31,7 +31,8 @@ from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 

@@ -30,10 +30,10 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
 from ssmail.paper.samples import WORST, Floats, Runs
 from ssmail.plots import style
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Group
+from ssmail.plots.run_groups import Group
+from ssmail.plots.series import figure_ablation, select
 from ssmail.store import Store
 
 NAME = "fig6"
@@ -113,7 +113,8 @@ def collect(
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
-    selection = select_ablation(store, NAME, runs, profile)
+    figure_ablation(NAME)  # without one there are no values for the axis
+    selection = select(store, NAME, runs, profile)
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,

@@ -44,7 +44,8 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection, select
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig7"

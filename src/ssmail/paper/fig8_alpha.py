@@ -34,13 +34,13 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
 from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Selection
+from ssmail.plots.run_groups import Selection
+from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig8"
@@ -98,7 +98,7 @@ def collect(
     `environment` is that of the ablation by default.
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
     """
-    selection = select_ablation(store, NAME, runs, profile, environment)
+    selection = select(store, NAME, runs, profile, environment)
     kind = ERRORS[selection.runs[0].environment]
     error = f"train/{kind}"
     errors = _bands(store, selection, error, [error], statistic)

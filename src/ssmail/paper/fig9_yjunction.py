@@ -19,7 +19,7 @@ from ssmail.config.experiments import figure_requirements
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns, style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import command
+from ssmail.plots.series import train_command
 from ssmail.store import RunRow, Store
 
 NAME = "fig9"
@@ -88,7 +88,7 @@ def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tup
         fitting = _holding(store, others, environment)
     if fitting:
         return fitting[-1], (f"the environment is that of run {fitting[-1].name}.",)
-    remedy = f"run {command(needed.methods[0], environment, profile)}"
+    remedy = f"run {train_command(needed.methods[0], environment, profile)}"
     if ids:
         raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
     found = "no finished run" if stored else "no run"

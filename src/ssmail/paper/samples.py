@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssmail.config.experiments import figure_requirements
 from ssmail.paper.claims import Sample
 from ssmail.plots import NoRuns
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.metric_units import is_error
-from ssmail.plots.selection import Group, Selection, select
+from ssmail.plots.run_groups import Group, Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
@@ -46,9 +45,8 @@ class Runs:
 
         Raises InputError for an unknown figure and for runs on different data.
         """
-        chosen = select if figure_requirements(figure).ablation is None else select_ablation
         try:
-            return cls(store, chosen(store, figure, profile=profile))
+            return cls(store, select(store, figure, profile=profile))
         except NoRuns:
             return cls(store)
 

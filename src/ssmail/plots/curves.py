@@ -22,7 +22,7 @@ from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.plots import style
 from ssmail.plots.metric_units import is_error
-from ssmail.plots.selection import Group
+from ssmail.plots.run_groups import Group
 from ssmail.store import RunRow, RunState
 
 CEILING = DIVERGED**2  # squared scaled units: where a scale of errors ends

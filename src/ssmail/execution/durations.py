@@ -1,34 +1,16 @@
-"""Which cells a figure of the paper needs, and how long they are going to take, judged by stored runs."""
+"""How long cells are going to take, estimated from stored runs."""
 
 from collections.abc import Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from ssmail.config.experiments import ablation, ablation_specs, build_spec, display_value, figure_requirements
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
 from ssmail.store import RunRow
 
 
-def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> dict[Cell, dict[str, Any]]:
-    """The cells that `figure` ("fig4") draws, each with what tells it from the others: method, the ablated key, seed.
-
-    Raises InputError for an unknown figure or profile.
-    """
-    needed = figure_requirements(figure)
-    specs: list[tuple[RunSpec, dict[str, Any]]] = []
-    if needed.ablation is None:
-        for method in needed.methods:
-            specs.append((build_spec(method, needed.environment, profile), {"method": method}))
-    else:
-        varied = ablation(needed.ablation, needed.environment)
-        for value, spec in ablation_specs(varied.name, profile, environment=varied.environment).items():
-            specs.append((spec, {"method": varied.method, varied.key: display_value(value)}))
-    return {Cell(spec, seed): {**names, "seed": seed} for spec, names in specs for seed in seeds}
-
-
 def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[RunSpec, float | None]:
-    """How long one run of each spec takes, judged by finished runs: the median of those of the spec, in seconds.
+    """Return how many seconds one run of each spec takes: the median of the finished runs of that spec.
 
     Without one, the median seconds for each update of the runs of the same method, environment and profile, times the
     spec's updates; None without those too. The start of a process, some seconds, is not counted.
@@ -51,12 +33,12 @@ def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[
 
 
 def total_seconds(each: Sequence[float], jobs: int) -> float:
-    """How long runs of these seconds take, `jobs` at a time: no less than the longest of them."""
+    """Return how long runs of these durations take, `jobs` at a time: at least as long as the longest of them."""
     return max(sum(each) / jobs, *each) if each else 0.0
 
 
 def longest_first(cells: Sequence[Cell], seconds: Mapping[RunSpec, float | None]) -> list[Cell]:
-    """The order that keeps every process busy to the end; cells of unknown length come first, by their updates."""
+    """Sort cells so that every process stays busy to the end; those of unknown duration come first, by updates."""
 
     def rank(cell: Cell) -> tuple[bool, float]:
         known = seconds[cell.spec]

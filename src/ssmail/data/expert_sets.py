@@ -17,12 +17,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from ssmail.config.sections import LettersSpec, YJunctionSpec
-from ssmail.data import letters
+from ssmail.config.sections import DataSpec, LettersSpec, YJunctionSpec
+from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
-from ssmail.data.yjunction import LANES, make_expert_set
 from ssmail.errors import InputError
 
 Contents = Mapping[str, Any]
@@ -72,6 +71,17 @@ class _File:
         if kind is np.float64 and not np.isfinite(array).all():
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
         return array
+
+
+def generate(data: DataSpec) -> ExpertSet:
+    """Generate the expert set of the environment whose parameters `data` has, one of config.spec.GENERATED.
+
+    Raises InputError for parameters that no set can have.
+    """
+    if data.letters is not None:
+        return letters.generate(data.letters)
+    assert data.yjunction is not None
+    return yjunction.generate(data.yjunction)
 
 
 def check_target(path: Path, *, force: bool) -> None:
@@ -166,9 +176,9 @@ def _read_yjunction(file: _File) -> ExpertSet:
             file.array(f"{split}/positions", shape, np.float64),
             file.array(f"{split}/velocities", shape, np.float64),
             file.array(f"{split}/mode", (count,), np.int64),
-            file.array(f"{split}/continuations", (len(LANES), *shape), np.float64),
+            file.array(f"{split}/continuations", (len(yjunction.LANES), *shape), np.float64),
         )
-    return make_expert_set(splits, file.contents["centre_lines"], params)
+    return yjunction.make_expert_set(splits, file.contents["centre_lines"], params)
 
 
 def _read_letters(file: _File) -> ExpertSet:
