@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from ssmail.data import expert_sets
-from ssmail.data.mocap.dataset import SPLITS, MocapParameters, make_expert_set, make_trajectories
+from ssmail.data.mocap.dataset import MocapParameters, bundle
+from ssmail.data.trajectories import SPLITS, Trajectories
 from ssmail.errors import InputError
 from ssmail.training.evaluators import ForecastEvaluator
 from ssmail.training.loop import TrainingLoop
@@ -35,9 +36,9 @@ def falling(tmp_path: Path) -> str:
         velocities = draw.normal(size=(3, 1, 2, 3)) + PULL * np.arange(frames).reshape(1, -1, 1, 1)
         positions = draw.normal(size=(3, 1, 2, 3)) + velocities.cumsum(axis=1)
         count = np.zeros(3, dtype=np.int64)
-        splits[split] = make_trajectories(positions, velocities, count, count)
+        splits[split] = Trajectories.single_mode(positions, velocities, count, count)
     params = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,), window=6, test_window=8)
-    expert_sets.save(make_expert_set(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
+    expert_sets.save(bundle(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
     return f"data.path={tmp_path / 'falling.npz'}"
 
 

@@ -1,7 +1,7 @@
-"""Where the files of a subject are found: anywhere below a folder, or inside a zip file.
+"""Find and read the files of a subject, anywhere below a folder or inside a zip file.
 
-A zip file is read member by member into memory, up to a limit, and never unpacked: no name in it can lead outside, and
-none can grow without bounds.
+Members of a zip file are read into memory, up to a limit, and never unpacked: no member can write outside its folder or
+grow without bounds.
 """
 
 import os
@@ -16,26 +16,26 @@ from typing import IO, Protocol
 
 from ssmail.errors import InputError
 
-LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes of a file; those of subject 35 have 7 kB and 0.5 MB
+LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes; the files of subject 35 have 7 kB and 0.5 MB
 
 
 class Source(Protocol):
-    """Files by name, to be read whole."""
+    """A collection of files by name."""
 
     @property
     def path(self) -> Path:
-        """Where they are."""
+        """The folder or zip file."""
 
     def names(self) -> Iterable[str]:
-        """The files, by their paths relative to `path`."""
+        """Return the paths of all files relative to `path`."""
 
     def read(self, name: str) -> bytes:
-        """The contents of a file. Raises InputError when it cannot be read or is larger than any of its kind."""
+        """Read a file. Raises InputError if it cannot be read, or if it is larger than LARGEST for its kind."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """The files of one subject: names in a source."""
+    """The files of one subject, as names in a source."""
 
     skeleton: str
     trials: dict[int, str]
@@ -43,7 +43,7 @@ class Subject:
 
 @contextmanager
 def open_source(path: Path) -> Iterator[Source]:
-    """The folder or zip file at `path`. Raises InputError when it is neither, or cannot be read."""
+    """Open the folder or zip file at `path`. Raises InputError if it is neither, or cannot be read."""
     if path.is_dir():
         yield _Folder(path)
         return
@@ -60,10 +60,10 @@ def open_source(path: Path) -> Iterator[Source]:
 
 
 def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject:
-    """The skeleton of a subject and those of its trials that are there, by the names SUBJECT.asf and
-    SUBJECT_TRIAL.amc in upper or lower case, with or without leading zeros.
+    """Find the skeleton of a subject and those of its trials that exist.
 
-    Raises InputError when there is no skeleton, and when one of these files is there twice.
+    Files are named SUBJECT.asf and SUBJECT_TRIAL.amc, in upper or lower case, with or without leading zeros. Raises
+    InputError if there is no skeleton, or if one of these files is there twice.
     """
     wanted: dict[int | None, list[str]] = {trial: [] for trial in (None, *trials)}
     for name in source.names():
@@ -84,7 +84,7 @@ def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject
 
 
 def shown(name: str) -> str:
-    """A name as a message shows it, on one line."""
+    """Format a name for a message, on one line."""
     return name if name.isprintable() else repr(name)
 
 
