@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ssmail.evaluation.order_statistics import ALPHA, Estimate
+from ssmail.evaluation.hypothesis_tests import ALPHA, Estimate
 
 
 class Verdict(StrEnum):

@@ -8,9 +8,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ssmail.evaluation import order_statistics as orders
-from ssmail.evaluation.order_statistics import UNKNOWN, Estimate
-from ssmail.evaluation.power import seeds_for_every, seeds_for_rank_test, seeds_for_sign_test
+from ssmail.evaluation import hypothesis_tests
+from ssmail.evaluation.hypothesis_tests import (
+    UNKNOWN,
+    Estimate,
+    seeds_for_every,
+    seeds_for_rank_test,
+    seeds_for_sign_test,
+)
 from ssmail.paper.claims import Part, Sample
 
 Side = Literal["below", "above"]
@@ -47,7 +52,7 @@ def median_seed(statement: str, statistic: str, sample: Sample, side: Side, bar:
     """Test that the median over all seeds of a method is below (above) the bar, with a sign test."""
 
     def tested() -> _Tested:
-        found = orders.sign_test(sample.values, bar)
+        found = hypothesis_tests.sign_test(sample.values, bar)
         p = (found.less, found.greater) if side == "below" else (found.greater, found.less)
         needed = seeds_for_sign_test(_inside(sample, side, bar) / len(sample.values))
         return _Tested(*_median(sample, side, bar), *p, needed)
@@ -59,10 +64,10 @@ def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Par
     """Test that runs of `small` have smaller values than those of `great`: rank test, Hodges-Lehmann shift."""
 
     def tested() -> _Tested:
-        needed = seeds_for_rank_test(orders.superiority(small.values, great.values))
-        effect = orders.shift(small.values, great.values)
+        needed = seeds_for_rank_test(hypothesis_tests.superiority(small.values, great.values))
+        effect = hypothesis_tests.shift(small.values, great.values)
         what = f"shift from {small.label} to {great.label} (Hodges-Lehmann)"
-        return _Tested(effect, what, *orders.rank_test(small.values, great.values), needed)
+        return _Tested(effect, what, *hypothesis_tests.rank_test(small.values, great.values), needed)
 
     return _part(statement, statistic, "exact rank test (Wilcoxon, Mann, Whitney)", (small, great), tested)
 
@@ -75,11 +80,11 @@ def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> 
     """
 
     def tested() -> _Tested:
-        near, far = orders.deviations(tight.values), orders.deviations(wide.values)
-        needed = seeds_for_rank_test(orders.superiority(near, far))
+        near, far = hypothesis_tests.deviations(tight.values), hypothesis_tests.deviations(wide.values)
+        needed = seeds_for_rank_test(hypothesis_tests.superiority(near, far))
         what = f"shift of the distance from the median, from {tight.label} to {wide.label} (Hodges-Lehmann)"
         seeds = None if needed is None else needed + 1  # for the distance that is left out
-        return _Tested(orders.shift(near, far), what, *orders.rank_test(near, far), seeds)
+        return _Tested(hypothesis_tests.shift(near, far), what, *hypothesis_tests.rank_test(near, far), seeds)
 
     test = "exact rank test of the distances from each group's median (Brown and Forsythe, structural zeros left out)"
     return _part(statement, statistic, test, (tight, wide), tested, least=LEAST_FOR_SPREAD)
@@ -93,7 +98,7 @@ def _inside(sample: Sample, side: Side, bar: float) -> int:
 
 def _median(sample: Sample, side: Side, bar: float) -> tuple[Estimate, str]:
     count = f"{_inside(sample, side, bar)} of {len(sample.values)} seeds"
-    return orders.median(sample.values), f"median ({count} {side} {bar:g})"
+    return hypothesis_tests.median(sample.values), f"median ({count} {side} {bar:g})"
 
 
 def _part(
