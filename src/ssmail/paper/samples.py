@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssmail.data.trajectories import Floats
 from ssmail.paper.claims import Sample
 from ssmail.plots import NoRuns
 from ssmail.plots.metric_units import is_error
@@ -20,7 +21,6 @@ from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
-Floats = npt.NDArray[np.float64]
 Array = npt.NDArray[Any]
 
 WORST, LEAST = np.inf, -np.inf  # what a diverged run counts as
@@ -114,7 +114,7 @@ class Runs:
 def _computed(
     read: Callable[[RunRow], list[Array]], number: Callable[..., float], diverged: float
 ) -> Callable[[RunRow], float]:
-    """The function that computes a finished run's number from what `read` finds: see the top of this module."""
+    """Return the function that computes a finished run's number from the values that `read` returns."""
 
     def value(run: RunRow) -> float:
         values = read(run)

@@ -61,6 +61,12 @@ class RunRow:
         """The first eight digits of the id, for messages and tables."""
         return self.id[:8]
 
+    @property
+    def code(self) -> str:
+        """The code that computed the run: "0.1.0+COMMIT", with "-dirty" where the tree was changed."""
+        commit = f"+{self.git_commit}" if self.git_commit else ""
+        return f"{self.package_version}{commit}{'-dirty' if self.git_dirty else ''}"
+
     @cached_property
     def spec(self) -> dict[str, Any]:
         """The spec as nested plain values, completed with the keys that were added after the run was stored."""
