@@ -54,7 +54,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     A backup of the old state is written beside the file first. Any command that opens an older database upgrades it,
     without a backup.
     """
-    from ssmail.store.maintenance.backup import upgrade as upgrade_database
+    from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
@@ -95,7 +95,7 @@ def backup(
 
     Safe while runs are being computed. Checkpoints are files of their own and are not copied.
     """
-    from ssmail.store.maintenance.backup import back_up
+    from ssmail.store.maintenance.sqlite_file import back_up
 
     size = back_up(db, file)
     if as_json:

@@ -4,6 +4,7 @@ SQLite runs in WAL mode, so readers never wait. Writers take turns: each write t
 which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock.
 """
 
+import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,11 +36,11 @@ def connect(where: str | Path) -> Engine:
             f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
         ) from error
     try:
-        if not _is_current(engine):
-            _upgrade(engine)
-    except DBAPIError as error:
-        engine.dispose()
-        raise explained(error.orig, describe(engine)) from error
+        with explained_errors(describe(engine)):
+            with engine.connect() as connection:
+                revision = revision_of(connection, engine)
+            if revision != REVISIONS[-1]:
+                _upgrade(engine)
     except SsmailError:
         engine.dispose()
         raise
@@ -49,23 +50,17 @@ def connect(where: str | Path) -> Engine:
 @contextmanager
 def reading(engine: Engine) -> Iterator[Connection]:
     """Yield a connection that reads one consistent state of the database; never waits for a writer."""
-    try:
-        with engine.connect() as connection:
-            yield connection
-    except DBAPIError as error:
-        raise explained(error.orig, describe(engine)) from error
+    with explained_errors(describe(engine)), engine.connect() as connection:
+        yield connection
 
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
     """Yield a connection in a write transaction. Waits for the write lock and holds it until the block ends."""
-    try:
-        with engine.connect() as connection:
-            connection = connection.execution_options(writes=True)
-            with connection.begin():
-                yield connection
-    except DBAPIError as error:
-        raise explained(error.orig, describe(engine)) from error
+    with explained_errors(describe(engine)), engine.connect() as connection:
+        connection = connection.execution_options(writes=True)
+        with connection.begin():
+            yield connection
 
 
 def describe(engine: Engine) -> str:
@@ -127,9 +122,16 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
     return str(revision)
 
 
-def explained(error: BaseException | None, where: str) -> SsmailError:
-    """Return an exception that explains an error of the database driver in one sentence."""
-    reason = str(error)
+@contextmanager
+def explained_errors(where: str) -> Iterator[None]:
+    """Turn errors of the database driver into an SsmailError that explains them in one sentence."""
+    try:
+        yield
+    except (DBAPIError, sqlite3.Error) as error:
+        raise _explained(str(error.orig if isinstance(error, DBAPIError) else error), where) from error
+
+
+def _explained(reason: str, where: str) -> SsmailError:
     if "not a database" in reason or "malformed" in reason:
         return InputError(f"{where} is not an SQLite database, or is damaged ({reason}); give another file")
     if "unable to open" in reason or "readonly" in reason:
@@ -155,13 +157,6 @@ def _prepare_path(url: URL) -> None:
         ) from error
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
-
-
-def _is_current(engine: Engine) -> bool:
-    """Return whether the schema is the current one. Raises InputError when this ssmail cannot use the database."""
-    with engine.connect() as connection:
-        revision = revision_of(connection, engine)
-    return revision == REVISIONS[-1]
 
 
 def _upgrade(engine: Engine) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Connection, Select, select
+from sqlalchemy import ColumnElement, Connection, Select, Table, func, select
 
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
@@ -122,6 +122,11 @@ def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
     """Return the full id for each id or prefix of one. Raises InputError for an unknown or ambiguous prefix."""
     return [_resolve_one(connection, prefix.strip().lower()) for prefix in prefixes]
+
+
+def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[bool]) -> int:
+    """Return the number of rows of the table that meet the conditions."""
+    return int(connection.execute(select(func.count()).select_from(table).where(*conditions)).scalar_one())
 
 
 def metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
