@@ -66,8 +66,8 @@ class PairLayer(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Apply the layer to all pairs, the diagonal included: x (..., N, D) -> (..., N, N, H)."""
         if not FAST:
-            x_i, x_j = torch.broadcast_tensors(x.unsqueeze(-2), x.unsqueeze(-3))
-            return self._apply_to(torch.cat([x_i, x_j], dim=-1))
+            x_i = x.unsqueeze(-2).expand(*x.shape[:-1], x.shape[-2], -1)  # (..., N, N, D)
+            return self._apply_to(torch.cat([x_i, x.unsqueeze(-3).expand_as(x_i)], dim=-1))
         pairs: Tensor = self.sender(x).unsqueeze(-2) + self.receiver(x).unsqueeze(-3)
         return pairs
 
