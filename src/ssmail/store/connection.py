@@ -28,7 +28,7 @@ def connect(where: str | Path) -> Engine:
     """
     url = as_url(where)
     if url.get_backend_name() == "sqlite":
-        _prepare_path(url)
+        _create_folder(Path(str(url.database)).parent)
     try:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
@@ -69,9 +69,12 @@ def describe(engine: Engine) -> str:
 
 
 def as_url(where: str | Path) -> URL:
-    """Return the URL for a path or URL, with an absolute path for SQLite. Raises InputError when it is neither."""
+    """Return the URL for a path or URL, with an absolute path for SQLite.
+
+    Raises InputError when `where` is neither, or is a folder.
+    """
     if isinstance(where, Path) or "://" not in where:
-        return URL.create("sqlite", database=str(Path(where).expanduser().absolute()))
+        return _file_url(Path(where).expanduser())
     try:
         url = make_url(where)
     except ArgumentError as error:
@@ -80,7 +83,7 @@ def as_url(where: str | Path) -> URL:
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
         raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
-    return url.set(database=str(Path(str(url.database)).absolute()))
+    return _file_url(Path(str(url.database)))
 
 
 def make_engine(url: URL) -> Engine:
@@ -147,16 +150,20 @@ def _show(url: URL) -> str:
     return url.render_as_string(hide_password=True)
 
 
-def _prepare_path(url: URL) -> None:
-    path = Path(str(url.database))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot create the folder {path.parent} for the database ({error.strerror}); choose a writable place"
-        ) from error
+def _file_url(path: Path) -> URL:
+    path = path.absolute()
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
+    return URL.create("sqlite", database=str(path))
+
+
+def _create_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot create the folder {folder} for the database ({error.strerror}); choose a writable place"
+        ) from error
 
 
 def _upgrade(engine: Engine) -> None:

@@ -65,11 +65,9 @@ class Upgrade:
 def existing(where: str | Path) -> Path:
     """Return the file of an SQLite database, given its path or URL.
 
-    Raises InputError for a server database and for a file that does not exist.
+    Raises InputError for a server database, a folder, or a file that does not exist.
     """
     path = file_of(where)
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
     if not path.exists():
         raise InputError(f"there is no database {path}; check the path, or create a database with `ssmail train`")
     return path
