@@ -16,7 +16,7 @@ from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
 from ssmail.config.spec import (
     ENVIRONMENTS,
-    GENERATED,
+    GENERATED_ENVIRONMENTS,
     METHODS,
     OPTIONAL_SECTIONS,
     RunSpec,
@@ -152,7 +152,7 @@ def _merge_layers(
         merged = merge(merged, layer.values)
     if method in METHODS and environment in ENVIRONMENTS:
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(required_sections(method, environment)))
-        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED) - {environment})}
+        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED_ENVIRONMENTS) - {environment})}
     label = flatten(merged).get(_LABEL)
     if isinstance(label, str):
         merged = merge(merged, _nested(_LABEL, _with_digest(label, experiments)))

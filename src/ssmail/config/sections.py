@@ -30,7 +30,7 @@ Section = TypeVar("Section", bound=Frozen)
 
 
 def required(section: Section | None) -> Section:
-    """Return a section that the method requires (spec.SECTIONS), for callers that serve no other methods."""
+    """Return a section that the method requires (spec.METHOD_SECTIONS), for callers that serve no other methods."""
     assert section is not None
     return section
 
@@ -105,9 +105,7 @@ class ModelSpec(Frozen):
     standardize: bool
     action_step: Positive  # largest change of velocity by an action; scaled units unless standardize
     action_bound: Positive  # largest distance of the velocity from 0 (with standardize: from the mean)
-    initial_scale: (
-        NonNegative  # of the actor's last weights; decides how far the untrained mean is from the current velocity
-    )
+    initial_scale: NonNegative  # of the actor's last weights: how far the untrained mean is from the current velocity
     log_std_min: Finite
     log_std_max: Finite
 

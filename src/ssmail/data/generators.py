@@ -6,7 +6,7 @@ from ssmail.data.trajectories import ExpertSet
 
 
 def generate(data: DataSpec) -> ExpertSet:
-    """The expert set of the environment whose parameters `data` has: one of ssmail.config.spec.GENERATED.
+    """The expert set of the environment whose parameters `data` has: one of ssmail.config.spec.GENERATED_ENVIRONMENTS.
 
     Raises InputError for parameters that no set can have.
     """
