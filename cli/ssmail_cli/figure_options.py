@@ -1,54 +1,44 @@
 """Options that the commands that draw share, and what they mean."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import unknown_name
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
 
-ALL, TRAINING = "all", "training"
 DEFAULT_OUT = Path("results/figures")
+DEFAULT_FORMATS = ["png"]
+
+
+def _known_formats(formats: list[str]) -> list[str]:
+    """The formats as given. Raises InputError for one that figures are not written in."""
+    from ssmail.plots.provenance import FORMATS
+
+    for name in formats:
+        if name not in FORMATS:
+            raise unknown_name("figure format", name, FORMATS)
+    return formats
+
 
 OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
 Formats = Annotated[
-    list[str] | None,
-    typer.Option("--format", help="png, pdf or svg; give it again for more than one.", show_default="png"),
+    list[str],
+    typer.Option("--format", callback=_known_formats, help="png, pdf or svg; repeatable.", show_default="png"),
 ]
 Stat = Annotated[
     str | None,
-    typer.Option(
-        "--stat",
-        help="Centre and band of fig3, fig4, fig6, fig7 and fig8: mean-std, median-iqr or mean-ci.",
-        show_default="mean-std",
-    ),
+    typer.Option("--stat", help="Centre and band: mean-std, median-iqr or mean-ci.", show_default="mean-std"),
 ]
 
 
-def check_formats(formats: Sequence[str]) -> None:
-    """Raise InputError for a format that figures are not written in."""
-    from ssmail.errors import unknown_name
-    from ssmail.plots.provenance import FORMATS
-
-    for form in formats:
-        if form not in FORMATS:
-            raise unknown_name("figure format", form, FORMATS)
-
-
-def parse_statistic(stat: str | None, figures: Sequence[str]) -> "Statistic | None":
-    """The statistic of that name. Raises InputError for an unknown one, and when none of the figures shows any."""
-    from ssmail.errors import unknown_name
+def parse_statistic(stat: str | None) -> "Statistic | None":
+    """Return the statistic of that name. Raises InputError for an unknown one."""
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.paper.results import FIGURES
 
-    if stat is None:
-        return None
-    if stat not in list(Statistic):
+    if stat is not None and stat not in list(Statistic):
         raise unknown_name("statistic", stat, list(Statistic))
-    if not any(name in (ALL, TRAINING) or (name in FIGURES and FIGURES[name].has_statistic) for name in figures):
-        raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
-    return Statistic(stat)
+    return None if stat is None else Statistic(stat)

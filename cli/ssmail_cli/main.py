@@ -2,9 +2,8 @@
 
 import difflib
 import os
-import re
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -32,9 +31,9 @@ app.command("ablate-alpha")(ablate.alias("alpha"))
 app.command("ablate-beta")(ablate.alias("beta"))
 app.command("reproduce")(reproduce.reproduce)
 app.command("report")(report.report)
-app.command("plot")(plot.plot)
 app.command("claims")(claims.claims)
 app.command("explain")(explain.explain)
+app.add_typer(plot.app, name="plot")
 app.add_typer(runs.app, name="runs")
 app.add_typer(db.app, name="db")
 
@@ -73,7 +72,7 @@ def run(arguments: list[str]) -> int:
         return 1
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
-            return _complain(_usage(error.format_message()), 2)
+            return _complain(_usage(error), 2)
         return _complain(complaint(error), 1)
     return code if isinstance(code, int) else 0
 
@@ -83,11 +82,13 @@ def _complain(sentence: str, code: int) -> int:
     return code
 
 
-def _usage(message: str) -> str:
-    """Typer's complaint as one sentence on one line, with the nearest option alone."""
-    sentence = " ".join(message.split()).replace("Value error, ", "").replace(": Input should", ": it should")
-    misspelt = re.match(r"No such option: (\S+) \(Possible options: (.*)\)$", sentence)
-    if misspelt:
-        nearest = difflib.get_close_matches(misspelt[1], misspelt[2].split(", "), n=1, cutoff=0)
-        return f"no such option {misspelt[1]}; did you mean {nearest[0]}?"
+def _usage(error: Any) -> str:
+    """Return Typer's error as one sentence on one line, with only the nearest option."""
+    if hasattr(error, "option_name") and hasattr(error, "possibilities"):  # an unknown option
+        command = error.ctx.command_path
+        near = difflib.get_close_matches(error.option_name, error.possibilities or [], n=1, cutoff=0)
+        hint = f"did you mean {near[0]}?" if near else f"`{command} --help` lists those it has."
+        return f"`{command}` has no option {error.option_name}; {hint}"
+    sentence = " ".join(error.format_message().split())
+    sentence = sentence.replace("Value error, ", "").replace(": Input should", ": it should")
     return sentence[:1].lower() + sentence[1:]

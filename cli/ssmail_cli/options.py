@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, unknown_name
 from ssmail_cli.display import Format
 
 if TYPE_CHECKING:
@@ -69,7 +69,6 @@ def select_runs(
     figure: str | None,
 ) -> "list[RunRow]":
     """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
-    from ssmail.errors import unknown_name
     from ssmail.paper.results import FIGURES
     from ssmail.store import RunState
 

@@ -1,216 +1,265 @@
-"""`ssmail plot`: figures of the paper, training curves and landscapes from the database alone; the skeleton."""
+"""`ssmail plot`: a command for each thing that is drawn, with the options of its own."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
+from ssmail.paper.results import FIGURES
 from ssmail_cli.display import note
 from ssmail_cli.drawing import INCOMPLETE, draw_all
-from ssmail_cli.figure_options import ALL, DEFAULT_OUT, TRAINING, Formats, OutDir, check_formats, parse_statistic
-from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
+from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
+from ssmail_cli.options import DEFAULT_DATABASE, Database, Environment, Profile, open_store
 from ssmail_cli.results import SHOWN, shown_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ssmail.evaluation.statistics import Statistic
-    from ssmail.paper.results import FigureModule
     from ssmail.plots import FigureRecord
     from ssmail.store import RunRow, Store
 
-SKELETON = "skeleton"
-OF_A_RUN = ("landscape", "film")
-DEFAULT_GROUPS = "method"
+ALL = "all"
 DEFAULT_METRICS = "; ".join(f"{shown.curve} of {name}" for name, shown in SHOWN.items())
-DEFAULT_DATA, DEFAULT_SPLIT = "data/mocap.npz", "test"
+FIGURE_RUNS = "those of experiments.yaml, else the spec with the most seeds"
 
 
-def plot(
-    figures: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="FIGURE...",
-            help="fig1 (landscapes), fig2 (vector-field), fig3 (curricula), fig4 (stability), fig5 (modes), "
-            "fig6 (beta), fig7 (noise), fig8 (alpha), fig9 (yjunction), or all of these; training, landscape, film, "
-            "skeleton.",
-        ),
-    ],
+class FigureGroup(TyperGroup):
+    """A group whose command line may name several things to draw, with options before, between and after the names.
+
+    `plot --out X fig4 fig5 --format pdf` runs `fig4 --out X --format pdf` and `fig5 --out X --format pdf`. The options
+    of every command are parsed before anything is drawn. An option that one of the commands does not have is an error,
+    except those in SHARED: they apply to the commands that have them.
+    """
+
+    SHARED = frozenset({"--runs", "--profile", "--stat", "--format", "--db"})
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Split the line into one line per command, and let click read the first, as it would for any group."""
+        names, options = self._split(args)
+        lines = ctx.meta["lines"] = [[name, *self._options_of(name, names, options)] for name in names]
+        return super().parse_args(ctx, lines[0] if lines else args)
+
+    def invoke(self, ctx: Any) -> None:
+        """Parse each line with the command that it names, then run the commands."""
+
+        lines = ctx.meta["lines"]
+        if not lines:
+            super().invoke(ctx)  # fails with "Missing command."
+        for name, *_ in lines:
+            if name not in self.commands:
+                raise unknown_name("figure", name, [*FIGURES, *self.commands])
+        if len(lines) > 1 and any(name == ALL for name, *_ in lines):
+            raise InputError(f"{ALL} is every figure of the paper already; give it alone.")
+        contexts = [self.commands[name].make_context(name, options, parent=ctx) for name, *options in lines]
+        for context in contexts:
+            with context:
+                context.command.invoke(context)
+
+    def _split(self, args: Sequence[str]) -> tuple[list[str], list[list[str]]]:
+        """Return the names, aliases resolved and each once, and the options, each with its value."""
+        flags = {"-h", "--help"} | {
+            option
+            for command in self.commands.values()
+            for parameter in command.params
+            if getattr(parameter, "is_flag", False)
+            for option in parameter.opts
+        }
+        names: list[str] = []
+        options: list[list[str]] = []
+        tokens = iter(args)
+        for token in tokens:
+            if not token.startswith("-"):
+                names.append(FIGURES[token].name if token in FIGURES else token)
+            elif token in flags or "=" in token:
+                options.append([token])
+            else:
+                options.append([token, *(value for value in [next(tokens, None)] if value is not None)])
+        return list(dict.fromkeys(names)), options
+
+    def _options_of(self, name: str, names: Sequence[str], options: Sequence[Sequence[str]]) -> list[str]:
+        """Return the options for one of the names: all but those in SHARED that only others of the names have."""
+
+        def has(command: str, option: str) -> bool:
+            parameters = self.commands[command].params if command in self.commands else []
+            return any(option in parameter.opts for parameter in parameters)
+
+        line: list[str] = []
+        for option in options:
+            key = option[0].partition("=")[0]
+            if has(name, key) or key not in self.SHARED or not any(has(other, key) for other in names):
+                line.extend(option)
+        return line
+
+
+app = typer.Typer(
+    cls=FigureGroup,
+    help="Draw figures of the paper, training curves, reward landscapes and recorded walking.\n\n"
+    "Give one name or several, as in `ssmail plot fig4 fig5 --format pdf`. A figure of the paper also goes by the name "
+    "in parentheses. Each drawing comes with a CSV of exactly what it shows, and its files list the runs behind it in "
+    "their metadata. Prints the paths of the files.",
+    subcommand_metavar="NAME... [OPTIONS]",
+    rich_markup_mode=None,
+)
+
+
+def _run_ids(texts: list[str] | None) -> list[str] | None:
+    """["ab,cd", "ef"] -> ["ab", "cd", "ef"]."""
+    return [part for text in texts or [] for part in text.split(",") if part] or None
+
+
+FigureRuns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--runs",
+        metavar="RUN[,RUN...]",
+        callback=_run_ids,
+        help="Draw these runs (ids or their first digits); repeatable.",
+        show_default=FIGURE_RUNS,
+    ),
+]
+OneRun = Annotated[
+    str, typer.Option("--run", metavar="RUN", help="Id of the run or its first digits; see `ssmail runs list`.")
+]
+
+
+def figure(
+    ctx: typer.Context,
+    runs: FigureRuns = None,
+    profile: Profile = None,
     out: OutDir = DEFAULT_OUT,
-    formats: Formats = None,
+    formats: Formats = DEFAULT_FORMATS,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Draw a figure without a centre and band."""
+    _draw_figure(str(ctx.info_name), runs, profile, out, formats, db)
+
+
+def figure_with_statistic(
+    ctx: typer.Context,
+    runs: FigureRuns = None,
+    profile: Profile = None,
+    stat: Stat = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Draw a figure with a centre and band."""
+    _draw_figure(str(ctx.info_name), runs, profile, out, formats, db, stat)
+
+
+def figure_on_environment(
+    ctx: typer.Context,
+    runs: FigureRuns = None,
+    environment: Annotated[
+        str | None, typer.Option("--env", help="Draw the runs on this environment.", show_default="the paper's")
+    ] = None,
+    profile: Profile = None,
+    stat: Stat = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Draw a figure with a centre and band, on another environment than the paper's if wanted."""
+    _draw_figure(str(ctx.info_name), runs, profile, out, formats, db, stat, environment)
+
+
+def _add_figures() -> None:
+    """Add a command for each figure of the paper, with the options that the figure has."""
+    for module in dict.fromkeys(FIGURES.values()):
+        draw: Callable[..., None] = figure_with_statistic if module.has_statistic else figure
+        if module.has_environment:
+            draw = figure_on_environment
+        app.command(module.name, help=f"({module.alias}) {module.summary[0].upper()}{module.summary[1:]}.")(draw)
+
+
+_add_figures()
+
+
+def _draw_figure(
+    name: str,
+    runs: Sequence[str] | None,
+    profile: str | None,
+    out: Path,
+    formats: Sequence[str],
+    db: str,
+    stat: str | None = None,
+    environment: str | None = None,
+) -> None:
+    from ssmail.config.experiments import figure_requirements
+
+    if runs and profile:
+        raise InputError("--runs names the runs already; leave --profile out.")
+    module, statistic = FIGURES[name], parse_statistic(stat)
+    record = module.collect(open_store(db), runs, profile=profile, statistic=statistic, environment=environment)
+    elsewhere = environment is not None and environment != figure_requirements(name).environment
+    _save(name, f"{module.stem}_{environment}" if elsewhere else module.stem, record, module.draw(record), out, formats)
+
+
+@app.command(ALL)
+def all_figures(
+    profile: Profile = None,
+    stat: Stat = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
+    db: Database = DEFAULT_DATABASE,
+) -> None:
+    """Every figure of the paper whose runs are stored.
+
+    For each of the others, prints the command that computes its runs on stderr, and ends with exit code 3.
+    """
+    if any(drawn.lacks for drawn in draw_all(open_store(db), out, formats, profile, parse_statistic(stat))):
+        raise typer.Exit(INCOMPLETE)
+
+
+@app.command()
+def training(
+    metrics: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="Draw this metric; repeatable.", show_default=DEFAULT_METRICS),
+    ] = None,
+    methods: Annotated[list[str] | None, typer.Option("--method", help="Only runs of this method; repeatable.")] = None,
+    environment: Environment = None,
+    profile: Profile = None,
     runs: Annotated[
         list[str] | None,
         typer.Option(
             "--runs",
             metavar="RUN[,RUN...]",
-            help="Draw these runs (ids or their first digits); repeatable.",
-            show_default="those of experiments.yaml, else the spec with the most seeds; of training: all",
+            callback=_run_ids,
+            help="Only these runs (ids or their first digits); repeatable.",
         ),
-    ] = None,
-    profile: Annotated[str | None, typer.Option("--profile", help="Only runs of this profile.")] = None,
-    stat: Annotated[
-        str | None,
-        typer.Option(
-            "--stat",
-            help="Centre and band of fig3, fig4, fig6, fig7, fig8 and training: mean-std, median-iqr or mean-ci.",
-            show_default="mean-std",
-        ),
-    ] = None,
-    metrics: Annotated[
-        list[str] | None,
-        typer.Option("--metric", help="training: draw this metric; repeatable.", show_default=DEFAULT_METRICS),
-    ] = None,
-    methods: Annotated[
-        list[str] | None, typer.Option("--method", help="training: only runs of this method; repeatable.")
-    ] = None,
-    environment: Annotated[
-        str | None,
-        typer.Option("--env", help="training, fig8: runs on this environment.", show_default="any; of fig8 mocap"),
     ] = None,
     group_by: Annotated[
-        str | None,
-        typer.Option(
-            "--group-by",
-            help="training: method, seed, or a key of the spec such as curriculum.beta.",
-            show_default=DEFAULT_GROUPS,
-        ),
-    ] = None,
-    run: Annotated[
-        str | None, typer.Option("--run", metavar="RUN", help="landscape, film: of this run (id or its first digits).")
-    ] = None,
-    epoch: Annotated[
-        int | None,
-        typer.Option("--epoch", min=0, help="landscape: after this epoch; 0 is untrained.", show_default="the last"),
-    ] = None,
-    data: Annotated[
-        Path | None,
-        typer.Option("--data", help="skeleton: the file that prep-mocap wrote.", show_default=DEFAULT_DATA),
-    ] = None,
-    split: Annotated[
-        str | None,
-        typer.Option("--split", help="skeleton: train, validation or test.", show_default=DEFAULT_SPLIT),
-    ] = None,
-    window: Annotated[
-        int | None, typer.Option("--window", min=0, help="skeleton: which window of the split.", show_default="0")
-    ] = None,
-    animate: Annotated[
-        bool | None, typer.Option("--animate", help="skeleton: make a film (GIF) too.", show_default=False)
-    ] = None,
+        str, typer.Option("--group-by", help="method, seed, or a key of the spec such as curriculum.beta.")
+    ] = "method",
+    stat: Stat = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
-    """Draw figures of the paper, the metrics of any runs over epochs (training), the learned reward of any planar run
-    (landscape, film), or recorded walking (skeleton).
+    """Any stored metric of any runs over epochs."""
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.plots import training_curves
 
-    Each comes with a CSV of exactly what it shows, and the ids of the runs stand in the metadata of the files. Prints
-    the paths of the files. `all` draws the paper's figures as far as their runs are stored, tells of the others what
-    makes their runs, and ends with exit code 3 when there are any.
-    """
-    from ssmail.paper.results import FIGURES
-
-    ids = [part for text in runs or [] for part in text.split(",") if part] or None
-    _check_figures(figures)
-    check_formats(formats or [])
-    training = {"--metric": metrics, "--method": methods, "--group-by": group_by}
-    skeleton = {"--data": data, "--split": split, "--window": window, "--animate": animate}
-    _check_owner([TRAINING], training, figures)
-    _check_owner([SKELETON], skeleton, figures)
-    _check_owner(OF_A_RUN, {"--run": run}, figures)
-    _check_owner(OF_A_RUN[:1], {"--epoch": epoch}, figures)
-    of_any = [key for key, module in FIGURES.items() if module.has_environment]
-    _check_owner([TRAINING, *of_any], {"--env": environment}, figures)
-    if ids and profile and figures != [TRAINING]:
-        raise InputError("--runs names the runs already; leave --profile out.")
-    statistic = parse_statistic(stat, figures)
-    if ALL in figures:
-        _draw_all(figures, ids, open_store(db), profile, statistic, out, formats)
-        return
-    names = dict.fromkeys(FIGURES[name].name if name in FIGURES else name for name in figures)
-    _check_runs(list(names), ids, profile, run)
-    store = open_store(db) if set(names) != {SKELETON} else None
-    for name in names:
-        if store is None or name == SKELETON:
-            _draw_skeleton(data or Path(DEFAULT_DATA), split or DEFAULT_SPLIT, window or 0, bool(animate), out, formats)
-        elif name == TRAINING:
-            chosen = _chosen(store, ids, methods, environment, profile)
-            usual = list(dict.fromkeys(shown_on(one.environment).curve for one in chosen))
-            _draw_training(chosen, store, metrics or usual, group_by, statistic, out, formats)
-        elif name in OF_A_RUN:
-            _draw_run(name, str(run), epoch, store, out, formats)
-        else:
-            module = FIGURES[name]
-            record = module.collect(store, ids, profile=profile, statistic=statistic, environment=environment)
-            _save(name, _stem(module, environment), record, module.draw(record), out, formats)
+    store = open_store(db)
+    chosen = _training_runs(store, runs, methods, environment, profile)
+    metrics = metrics or list(dict.fromkeys(shown_on(run.environment).curve for run in chosen))
+    record = training_curves.collect(store, chosen, metrics, group_by, parse_statistic(stat) or Statistic.MEAN_STD)
+    _save("training", record.stem, record, training_curves.draw(record), out, formats)
 
 
-def _draw_all(
-    figures: Sequence[str],
-    ids: Sequence[str] | None,
-    store: "Store",
-    profile: str | None,
-    statistic: "Statistic | None",
-    out: Path,
-    formats: Sequence[str] | None,
-) -> None:
-    """The paper's figures, each if it can be drawn; raises Exit(INCOMPLETE) when one cannot."""
-    if list(figures) != [ALL]:
-        raise InputError(f"{ALL} is every figure of the paper already; give it alone.")
-    if ids:
-        raise InputError(f"{ALL} draws the runs of each figure; leave --runs out.")
-    if any(drawn.lacks for drawn in draw_all(store, out, formats or ["png"], profile, statistic)):
-        raise typer.Exit(INCOMPLETE)
-
-
-def _check_runs(names: Sequence[str], ids: Sequence[str] | None, profile: str | None, run: str | None) -> None:
-    """Refuse a choice of runs for figures that show none, or another one."""
-    if set(names) <= {SKELETON, *OF_A_RUN} and (ids or profile):
-        what = "the run of --run" if set(names) & set(OF_A_RUN) else "no runs"
-        raise InputError(f"{names[0]} shows {what}; leave {'--runs' if ids else '--profile'} out.")
-    for name in names:
-        if name in OF_A_RUN and run is None:
-            raise InputError(f"{name} shows one run; name it with --run (`ssmail runs list` shows those there are).")
-
-
-def _check_figures(figures: Sequence[str]) -> None:
-    """Refuse unknown names."""
-    from ssmail.errors import unknown_name
-    from ssmail.paper.results import FIGURES
-
-    for name in figures:
-        others = (ALL, TRAINING, SKELETON, *OF_A_RUN)
-        if name not in FIGURES and name not in others:
-            raise unknown_name("figure", name, [*FIGURES, *others])
-
-
-def _check_owner(owners: Sequence[str], options: Mapping[str, object], figures: Sequence[str]) -> None:
-    """Refuse the options of some figures beside others that know nothing of them."""
-    given = [option for option, value in options.items() if value is not None]
-    others = [name for name in figures if name not in owners]
-    if given and others:
-        names = " and ".join(f"`ssmail plot {owner}`" for owner in owners[:2])
-        raise InputError(f"{given[0]} belongs to {names}; draw {', '.join(others)} without it.")
-
-
-def _stem(module: "FigureModule", environment: str | None) -> str:
-    """The files' name without ending; of another environment than the paper's it names that."""
-    from ssmail.config.experiments import figure_requirements
-
-    if environment in (None, figure_requirements(module.name).environment):
-        return module.stem
-    return f"{module.stem}_{environment}"
-
-
-def _chosen(
+def _training_runs(
     store: "Store",
     ids: Sequence[str] | None,
     methods: Sequence[str] | None,
     environment: str | None,
     profile: str | None,
 ) -> "list[RunRow]":
-    """The runs that meet every condition, newest last. Raises InputError when there is none, or an unknown name."""
+    """Return the runs that meet every condition, newest last. Raises InputError for an unknown method or no run."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.errors import unknown_name
 
     runs = store.runs(ids=ids, environment=environment, profile=profile)
     for method in methods or []:
@@ -223,55 +272,62 @@ def _chosen(
     return runs
 
 
-def _draw_training(
-    runs: "list[RunRow]",
-    store: "Store",
-    metrics: Sequence[str],
-    group_by: str | None,
-    statistic: "Statistic | None",
-    out: Path,
-    formats: Sequence[str] | None,
+@app.command()
+def landscape(
+    run: OneRun,
+    epoch: Annotated[
+        int | None, typer.Option("--epoch", min=0, help="After this epoch; 0 is untrained.", show_default="the last")
+    ] = None,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
+    db: Database = DEFAULT_DATABASE,
 ) -> None:
-    from ssmail.evaluation.statistics import Statistic
-    from ssmail.plots import training_curves
-
-    record = training_curves.collect(store, runs, metrics, group_by or DEFAULT_GROUPS, statistic or Statistic.MEAN_STD)
-    _save(TRAINING, record.stem, record, training_curves.draw(record), out, formats)
-
-
-def _draw_run(name: str, run: str, epoch: int | None, store: "Store", out: Path, formats: Sequence[str] | None) -> None:
-    """The landscape of a run, or the film of its landscapes."""
+    """The learned reward of a run on a plane, after one epoch."""
     from ssmail.plots import landscape_film
 
-    record = landscape_film.collect(store, run, name, epoch)
-    if name == landscape_film.LANDSCAPE:
-        _save(name, record.stem, record, landscape_film.draw(record), out, formats)
-        return
-    for remark in record.notes:
-        note(f"{name}: {remark}")
+    record = landscape_film.collect(open_store(db), run, landscape_film.LANDSCAPE, epoch)
+    _save("landscape", record.stem, record, landscape_film.draw(record), out, formats)
+
+
+@app.command()
+def film(run: OneRun, out: OutDir = DEFAULT_OUT, db: Database = DEFAULT_DATABASE) -> None:
+    """The learned reward of a run on a plane, over training (GIF)."""
+    from ssmail.plots import landscape_film
+
+    record = landscape_film.collect(open_store(db), run, landscape_film.FILM)
+    _print_notes("film", record)
     typer.echo(landscape_film.save_film(record, out))
 
 
-def _draw_skeleton(
-    data: Path, split: str, window: int, animate: bool, out: Path, formats: Sequence[str] | None
+@app.command()
+def skeleton(
+    data: Annotated[Path, typer.Option("--data", help="The file that prep-mocap wrote.")] = Path("data/mocap.npz"),
+    split: Annotated[str, typer.Option("--split", help="train, validation or test.")] = "test",
+    window: Annotated[int, typer.Option("--window", min=0, help="Number of the window in the split.")] = 0,
+    animate: Annotated[bool, typer.Option("--animate", help="Make a film (GIF) too.")] = False,
+    out: OutDir = DEFAULT_OUT,
+    formats: Formats = DEFAULT_FORMATS,
 ) -> None:
-    from ssmail.plots import skeleton
+    """Recorded walking, from the motion-capture data alone."""
+    from ssmail.plots import skeleton as skeleton_plot
 
-    record = skeleton.collect(data, split, window)
-    _save(SKELETON, record.stem, record, skeleton.draw(record), out, formats)
+    record = skeleton_plot.collect(data, split, window)
+    _save("skeleton", record.stem, record, skeleton_plot.draw(record), out, formats)
     if animate:
-        film = out / f"{record.stem}.gif"
-        skeleton.save_film(record, film)
-        typer.echo(film)
+        path = out / f"{record.stem}.gif"
+        skeleton_plot.save_film(record, path)
+        typer.echo(path)
 
 
-def _save(
-    name: str, stem: str, record: "FigureRecord", figure: "Figure", out: Path, formats: Sequence[str] | None
-) -> None:
-    """Write the files, tell the notes on stderr and the paths on stdout."""
+def _save(name: str, stem: str, record: "FigureRecord", drawn: "Figure", out: Path, formats: Sequence[str]) -> None:
+    """Write the files; print the notes on stderr and the paths on stdout."""
     from ssmail.plots.saving import save_figure
 
+    _print_notes(name, record)
+    for path in save_figure(stem, record, drawn, out, formats):
+        typer.echo(path)
+
+
+def _print_notes(name: str, record: "FigureRecord") -> None:
     for remark in record.notes:
         note(f"{name}: {remark}")
-    for path in save_figure(stem, record, figure, out, formats or ["png"]):
-        typer.echo(path)

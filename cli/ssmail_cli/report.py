@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail_cli.drawing import INCOMPLETE, draw_all
-from ssmail_cli.figure_options import ALL, DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
+from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def report(
         typer.Option("--profile", help="Runs of this profile.", show_default="the one that each figure draws"),
     ] = None,
     out: OutDir = DEFAULT_OUT,
-    formats: Formats = None,
+    formats: Formats = DEFAULT_FORMATS,
     stat: Stat = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
@@ -30,10 +30,9 @@ def report(
     Draws every figure whose runs are stored into --out, and beside that folder writes report.md and report.html, one
     page without any other file. Prints the paths. Exit code 3: a figure could not be drawn; the report says why.
     """
-    check_formats(formats or [])
-    statistic = parse_statistic(stat, [ALL])
+    statistic = parse_statistic(stat)
     store = open_store(db)
-    figures = draw_all(store, out, formats or ["png"], profile, statistic)
+    figures = draw_all(store, out, formats, profile, statistic)
     command = f"ssmail report --db {db}" + (f" --profile {profile}" if profile else "")
     write_report(store, figures, out, command, profile)
     if any(drawn.lacks for drawn in figures):

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, unknown_name
+from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import training_options as options
 from ssmail_cli.display import chosen_format, complaint, note, print_rows
 from ssmail_cli.drawing import draw_or_tell, undrawn
-from ssmail_cli.figure_options import DEFAULT_OUT, Formats, OutDir, Stat, check_formats, parse_statistic
+from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
 from ssmail_cli.progress import Sweep, label
 from ssmail_cli.report import write_report
@@ -60,7 +61,7 @@ def reproduce(
     ] = False,
     as_json: Json = False,
     out: OutDir = DEFAULT_OUT,
-    formats: Formats = None,
+    formats: Formats = DEFAULT_FORMATS,
     stat: Stat = None,
     db: Database = DEFAULT_DATABASE,
 ) -> None:
@@ -76,10 +77,11 @@ def reproduce(
     from ssmail.execution.figure_cells import longest_first
     from ssmail.store import Store
 
-    check_formats(formats or [])
     given = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
     figures = _figures(only, profile, parse_seeds(given))
-    statistic = parse_statistic(stat, list(figures))
+    statistic = parse_statistic(stat)
+    if statistic is not None and not any(FIGURES[name].has_statistic for name in figures):
+        raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
     data = look_for_data(figures, cmu)
     if only is not None and set(data.missing) == set(figures):
         raise InputError(f"{next(iter(data.missing.values()))}.")
@@ -102,7 +104,7 @@ def reproduce(
     ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
     ended |= settled_runs(store, _merged(figures[name] for name in data.missing))
     drawn = [
-        _draw(store, name, cells, ended, data.missing.get(name), statistic, out, formats or ["png"])
+        _draw(store, name, cells, ended, data.missing.get(name), statistic, out, formats)
         for name, cells in figures.items()
     ]
     written = only is not None or _report(store, drawn, out, db, profile, given, sweep, rows)
@@ -126,9 +128,7 @@ def _wait(store: "Store", sweep: Sweep) -> None:
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """The cells of each figure that is wanted, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.errors import unknown_name
     from ssmail.execution.figure_cells import figure_cells
-    from ssmail.paper.results import FIGURES
 
     listed = load_experiments().figures
     choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}

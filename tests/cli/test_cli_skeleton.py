@@ -20,9 +20,12 @@ def data(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_needs_neither_runs_nor_a_database(cli: CommandLine, data: Path, tmp_path: Path) -> None:
+def test_it_needs_neither_runs_nor_a_database(
+    cli: CommandLine, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, nowhere = tmp_path / "figures", tmp_path / "absent.db"
-    outcome = cli("plot", "skeleton", "--data", data, "--out", out, "--db", nowhere, "--format", "svg")
+    monkeypatch.setenv("SSMAIL_DB", str(nowhere))
+    outcome = cli("plot", "skeleton", "--data", data, "--out", out, "--format", "svg")
     assert outcome.code == 0
     assert [Path(line).name for line in outcome.out.splitlines()] == ["skeleton_test-0.svg", "skeleton_test-0.csv"]
     assert outcome.err == "skeleton: test window 0 of 0-0: trial 35_03 from frame 2 on.\n"
@@ -54,12 +57,12 @@ def test_a_set_without_a_skeleton_is_refused_with_what_makes_one(cli: CommandLin
         ("skeleton --window 1", "there is no file data/mocap.npz"),
         ("skeleton --window -1", "'--window': it should be greater than or equal to 0"),
         ("skeleton --split tets", "unknown split 'tets'; did you mean test?"),
-        ("skeleton --runs ab", "skeleton shows no runs; leave --runs out."),
-        ("skeleton --profile quick", "skeleton shows no runs; leave --profile out."),
-        ("skeleton --stat mean-ci", "skeleton shows no centre and band; leave --stat out."),
-        ("skeleton --metric a", "--metric belongs to `ssmail plot training`; draw skeleton without it."),
-        ("fig4 --animate", "--animate belongs to `ssmail plot skeleton`; draw fig4 without it."),
-        ("training skeleton --window 0", "--window belongs to `ssmail plot skeleton`; draw training without it."),
+        ("skeleton --runs ab", "`ssmail plot skeleton` has no option --runs;"),
+        ("skeleton --profile quick", "`ssmail plot skeleton` has no option --profile;"),
+        ("skeleton --stat mean-ci", "`ssmail plot skeleton` has no option --stat;"),
+        ("skeleton --metric a", "`ssmail plot skeleton` has no option --metric;"),
+        ("fig4 --animate", "`ssmail plot fig4` has no option --animate;"),
+        ("training skeleton --window 0", "`ssmail plot training` has no option --window;"),
         ("skeletn", "unknown figure 'skeletn'; did you mean skeleton?"),
     ],
 )
