@@ -106,11 +106,11 @@ def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
 
 
 def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
-    from ssmail.data import expert_file
-    from ssmail.data.generators import generate
+    from ssmail.data import expert_sets
+    from ssmail.data.expert_sets import generate
 
     experts = generate(data)
-    expert_file.save(experts, out, force=force)
+    expert_sets.save(experts, out, force=force)
     if as_json:
         write_json({"path": out, "hash": experts.hash, "parameters": experts.parameters}, None)
         return

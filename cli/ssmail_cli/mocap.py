@@ -44,7 +44,7 @@ def prep_mocap(
     The trials are cut into windows of 50 frames, and of 100 for testing. The .npz holds positions and velocities of
     all joints in the files' own units, the skeleton, and where each window is from. Train on it with --env mocap.
     """
-    from ssmail.data import expert_file
+    from ssmail.data import expert_sets
     from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
 
     wanted = MocapParameters(
@@ -57,14 +57,14 @@ def prep_mocap(
         raise InputError("--cache belongs to --download; leave --cache out, or let --download fetch the files into it")
     if (source is None) == (not download):
         raise InputError("give either --source with a folder or zip file of the CMU files, or --download")
-    expert_file.check_target(out, force=force)
+    expert_sets.check_target(out, force=force)
     if source is None:
         from ssmail.data.mocap.download import fetch
 
         trials = (*wanted.train, *wanted.validation, *wanted.test)
         source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing)
     experts = prepare(source, wanted, allow_missing=allow_missing)
-    expert_file.save(experts, out, force=force)
+    expert_sets.save(experts, out, force=force)
     _tell(experts, out, as_json)
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.data import expert_file
+from ssmail.data import expert_sets
 from ssmail.data.mocap.dataset import SPLITS, MocapParameters, make_expert_set, make_trajectories
 from ssmail.errors import InputError
 from ssmail.training.evaluators import ForecastEvaluator
@@ -37,7 +37,7 @@ def falling(tmp_path: Path) -> str:
         count = np.zeros(3, dtype=np.int64)
         splits[split] = make_trajectories(positions, velocities, count, count)
     params = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,), window=6, test_window=8)
-    expert_file.save(make_expert_set(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
+    expert_sets.save(make_expert_set(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
     return f"data.path={tmp_path / 'falling.npz'}"
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.models.features import Features
-from ssmail.models.standards import Standards
+from ssmail.models.normalization import Normalization
 from ssmail.training import landscapes
 from ssmail.training.landscapes import Landscapes, Moments, current_epoch, looks, position_gradient
 from ssmail.training.learning import Setting
@@ -65,10 +65,10 @@ def test_the_gradient_is_of_the_agents_own_position_alone(loop: TrainingLoop) ->
 def test_the_gradient_is_in_scaled_units_whatever_the_networks_read(loop: TrainingLoop) -> None:
     states = loop.experts.states
     plain = Features(False, False, 50)
-    features = replace(plain, standards=Standards.of(states))
+    features = replace(plain, normalization=Normalization.fit(states))
     learner = Handmade(loop, lambda x, actions: x[..., 0], features)
     _, gradient = position_gradient(learner, Moments.of(features, states, loop.experts.actions), 2)
-    expected = 1 / Standards.of(states).spread[2, 0]
+    expected = 1 / Normalization.fit(states).std[2, 0]
     torch.testing.assert_close(gradient[..., 0].max(), expected)
     assert expected != 1
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ssmail.config.sections import ModelSpec, VariationalSpec
-from ssmail.models.standards import Standards
+from ssmail.models.normalization import Normalization
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Features:
     steps: the trajectory length that the step index is scaled with: 0 .. steps - 1 -> -1 .. 1.
     root_relative: positions are differences to those of agent 0, the root of a skeleton; its own are then zeros.
     agents: N of the one-hot of the agent; 0 leaves it out.
-    standards: the units that an agent's state and action are read in; None leaves them in scaled units.
+    normalization: the units that an agent's state and action are read in; None leaves them in scaled units.
     """
 
     time: bool
@@ -26,7 +26,7 @@ class Features:
     steps: int
     root_relative: bool = False
     agents: int = 0
-    standards: Standards | None = None
+    normalization: Normalization | None = None
 
     @classmethod
     def of(cls, spec: ModelSpec | VariationalSpec, experts: Tensor) -> "Features":
@@ -35,7 +35,7 @@ class Features:
         plain = cls(False, False, steps, spec.root_relative, agents * spec.agent_input)
         if isinstance(spec, ModelSpec):
             plain = replace(plain, time=spec.time_input, start=spec.start_input)
-        return replace(plain, standards=Standards.of(plain._relative(experts))) if spec.standardize else plain
+        return replace(plain, normalization=Normalization.fit(plain._relative(experts))) if spec.standardize else plain
 
     def size(self, state_size: int) -> int:
         """Number of features of an agent with D state features."""
@@ -57,16 +57,16 @@ class Features:
 
     def of_actions(self, actions: Tensor) -> Tensor:
         """Actions (..., N, A), which are velocities, in the units that they are read in."""
-        return actions if self.standards is None else self.standards.velocity.standardize(actions)
+        return actions if self.normalization is None else self.normalization.velocity.normalize(actions)
 
     def to_actions(self, read: Tensor) -> Tensor:
         """Actions (..., N, A) in scaled units from what a network says in those that it reads."""
-        return read if self.standards is None else self.standards.velocity.restore(read)
+        return read if self.normalization is None else self.normalization.velocity.denormalize(read)
 
     def read(self, states: Tensor) -> Tensor:
         """States (..., N, 2P) in the units that they are read in."""
         relative = self._relative(states)
-        return relative if self.standards is None else self.standards.standardize(relative)
+        return relative if self.normalization is None else self.normalization.normalize(relative)
 
     def _relative(self, states: Tensor) -> Tensor:
         """States (..., N, 2P) with the positions that are read."""

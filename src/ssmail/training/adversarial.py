@@ -27,8 +27,8 @@ from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alph
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
-from ssmail.models.standards import Reach
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learning import Setting
@@ -75,7 +75,9 @@ class AdversarialLearner:
         inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(inputs, action_size, model, Reach.of(model, self.features.standards)).to(self.device)
+            policy = GraphPolicy(inputs, action_size, model, ActionBounds.of(model, self.features.normalization)).to(
+                self.device
+            )
             critic = TwinCritic(inputs + action_size, model).to(self.device)
             self.discriminator = Discriminator(inputs + action_size, model.hidden).to(self.device)
         self.actor_critic = ActorCritic(

@@ -7,8 +7,8 @@ from torch import nn
 
 from ssmail.config.sections import required
 from ssmail.models.features import Features
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
-from ssmail.models.standards import Reach
 from ssmail.training.learning import Setting
 from ssmail.training.learning_rates import DecayingRates
 from ssmail.training.policy_predictor import PolicyPredictor
@@ -27,7 +27,9 @@ class CloningLearner:
         features = Features.of(model, setting.experts.states)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(features.size(state_size), action_size, model, Reach.of(model, features.standards))
+            policy = GraphPolicy(
+                features.size(state_size), action_size, model, ActionBounds.of(model, features.normalization)
+            )
         self.policy = policy.to(self.device)
         self.predictor = PolicyPredictor(self.policy, features, setting.integrator)
         self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=self.cloning.learning_rate, fused=True)

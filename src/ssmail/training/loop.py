@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
-from ssmail.data.expert_file import load
-from ssmail.data.generators import generate
+from ssmail.data.expert_sets import generate, load
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError

@@ -19,10 +19,10 @@ import numpy as np
 from pydantic import Field
 
 from ssmail.config.sections import Frozen
-from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
+from ssmail.data.mocap.acclaim_lines import AGAIN
+from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions
-from ssmail.data.mocap.lines import AGAIN
-from ssmail.data.mocap.motion import parse_motion
 from ssmail.data.mocap.source import Source, find_subject, open_source, shown
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories

@@ -20,12 +20,10 @@ P + O t. Both are zero in the CMU database, where the root is simply at t, turne
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ssmail.data.mocap.acclaim import Skeleton
-from ssmail.data.mocap.motion import Motion
-
-Floats = NDArray[np.float64]
+from ssmail.data.mocap.amc import Motion
+from ssmail.data.mocap.asf import Skeleton
+from ssmail.data.trajectories import Floats
 
 
 def rotation(angles: Floats, order: str) -> Floats:

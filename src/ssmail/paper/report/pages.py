@@ -12,6 +12,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from ssmail import __version__
+from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
 from ssmail.paper.claims import Verdict
 from ssmail.paper.report.contents import Report, code_of, samples_of
@@ -33,11 +34,9 @@ def write(report: Report, folder: Path) -> list[Path]:
     pages = {MARKDOWN: markdown(report, folder), HTML: html(report)}
     paths = [folder / name for name in pages]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         for path, text in zip(paths, pages.values(), strict=True):
-            partial = path.with_name(f".{path.name}.{os.getpid()}")
-            partial.write_text(text, encoding="utf-8", newline="\n")
-            partial.replace(path)
+            with atomic_write(path) as partial:
+                partial.write_text(text, encoding="utf-8", newline="\n")
     except OSError as error:
         raise InputError(f"{folder} cannot be written: {error.strerror}; choose another folder.") from None
     return paths

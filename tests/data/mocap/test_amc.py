@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmail.data.mocap.motion import Motion, parse_motion
+from ssmail.data.mocap.amc import Motion, parse_motion
 from ssmail.errors import InputError
 from tests.data.mocap.handmade import PERSON, STILL, B, amc, skeleton, walk
 from tests.data.mocap.refusal import sentence_of

@@ -3,7 +3,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.distributions import AffineTransform, Independent, Normal, TanhTransform, TransformedDistribution
 
-from ssmail.models.actor import EDGE, Actor
+from ssmail.models.policy import EDGE, Actor
 from tests.models.test_message_passing import SPEC, one_hot_graph
 
 

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ssmail.config.sections import YJunctionSpec
-from ssmail.data import expert_file, yjunction
+from ssmail.data import expert_sets, yjunction
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.data.trajectories import ExpertSet
 from ssmail.errors import InputError
@@ -20,7 +20,7 @@ PARAMS = YJunctionSpec(train=4, validation=3, test=2, agents=3, steps=50, lane_a
 @pytest.fixture
 def saved(tmp_path: Path) -> Path:
     path = tmp_path / "sub" / "experts.npz"
-    expert_file.save(yjunction.generate(PARAMS), path)
+    expert_sets.save(yjunction.generate(PARAMS), path)
     return path
 
 
@@ -32,7 +32,7 @@ def altered(path: Path, **changes: np.ndarray | None) -> Path:
 
 
 def test_round_trip(saved: Path) -> None:
-    made, read = yjunction.generate(PARAMS), expert_file.load(saved)
+    made, read = yjunction.generate(PARAMS), expert_sets.load(saved)
     assert read.hash == made.hash
     assert read.parameters == made.parameters
     np.testing.assert_array_equal(read.validation.continuations, made.validation.continuations)
@@ -42,10 +42,10 @@ def test_round_trip(saved: Path) -> None:
 def test_refuses_to_overwrite(saved: Path) -> None:
     before = saved.read_bytes()
     with pytest.raises(InputError, match="--force"):
-        expert_file.save(yjunction.generate(PARAMS), saved)
+        expert_sets.save(yjunction.generate(PARAMS), saved)
     assert saved.read_bytes() == before
-    expert_file.save(yjunction.generate(PARAMS.model_copy(update={"seed": 1})), saved, force=True)
-    assert expert_file.load(saved).parameters["seed"] == 1
+    expert_sets.save(yjunction.generate(PARAMS.model_copy(update={"seed": 1})), saved, force=True)
+    assert expert_sets.load(saved).parameters["seed"] == 1
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -55,7 +55,7 @@ def test_truncated_file(saved: Path, cut: float) -> None:
     broken = saved.with_name("broken.npz")
     broken.write_bytes(whole[: int(cut * len(whole))])
     with pytest.raises(InputError, match=r"broken\.npz is truncated or not an \.npz"):
-        expert_file.load(broken)
+        expert_sets.load(broken)
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -64,7 +64,7 @@ def test_junk(tmp_path: Path, junk: bytes) -> None:
     path = tmp_path / "junk.npz"
     path.write_bytes(junk)
     with pytest.raises(InputError, match=r"junk\.npz"):
-        expert_file.load(path)
+        expert_sets.load(path)
 
 
 def test_each_fault_is_named(saved: Path, tmp_path: Path) -> None:
@@ -73,7 +73,7 @@ def test_each_fault_is_named(saved: Path, tmp_path: Path) -> None:
     def check(pattern: str, **changes: np.ndarray | None) -> None:
         saved.write_bytes(good)
         with pytest.raises(InputError, match=pattern) as caught:
-            expert_file.load(altered(saved, **changes))
+            expert_sets.load(altered(saved, **changes))
         assert "\n" not in str(caught.value)
         assert str(saved) in str(caught.value)
 
@@ -86,19 +86,19 @@ def test_each_fault_is_named(saved: Path, tmp_path: Path) -> None:
     check("parameters inside", parameters=np.array("{"))
     check("parameters inside", parameters=np.array('{"train": -1}'))
     with pytest.raises(InputError, match="there is no file"):
-        expert_file.load(tmp_path / "absent.npz")
+        expert_sets.load(tmp_path / "absent.npz")
     single = tmp_path / "single.npy"
     np.save(single, positions)
     with pytest.raises(InputError, match="single array"):
-        expert_file.load(single)
+        expert_sets.load(single)
     with pytest.raises(InputError, match="truncated or not"):
-        expert_file.load(tmp_path)
+        expert_sets.load(tmp_path)
 
 
 def test_unwritable_place(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot write"):
-        expert_file.save(yjunction.generate(PARAMS), tmp_path / "file" / "experts.npz")
+        expert_sets.save(yjunction.generate(PARAMS), tmp_path / "file" / "experts.npz")
 
 
 @pytest.fixture
@@ -109,12 +109,12 @@ def mocap(tmp_path: Path) -> ExpertSet:
 
 @pytest.fixture
 def recorded(mocap: ExpertSet, tmp_path: Path) -> Path:
-    expert_file.save(mocap, tmp_path / "mocap.npz")
+    expert_sets.save(mocap, tmp_path / "mocap.npz")
     return tmp_path / "mocap.npz"
 
 
 def test_mocap_round_trip(mocap: ExpertSet, recorded: Path) -> None:
-    read = expert_file.load(recorded, "mocap")
+    read = expert_sets.load(recorded, "mocap")
     for field in ("hash", "parameters", "joints", "parents", "sources", "environment", "scaling"):
         assert getattr(read, field) == getattr(mocap, field)
     for split in ("train", "validation", "test"):
@@ -132,13 +132,13 @@ def test_mocap_round_trip(mocap: ExpertSet, recorded: Path) -> None:
 
 
 def test_a_set_is_of_one_environment(saved: Path, recorded: Path) -> None:
-    assert expert_file.load(saved, "yjunction").environment == "yjunction"
+    assert expert_sets.load(saved, "yjunction").environment == "yjunction"
     with pytest.raises(InputError, match=r"experts\.npz is an expert set of yjunction, not of mocap; .*--env yjunct"):
-        expert_file.load(saved, "mocap")
+        expert_sets.load(saved, "mocap")
     with pytest.raises(InputError, match=r"mocap\.npz is an expert set of mocap, not of yjunction; .*--env mocap"):
-        expert_file.load(recorded, "yjunction")
+        expert_sets.load(recorded, "yjunction")
     with pytest.raises(InputError, match=r"there is no file .*make it with `ssmail prep-mocap --out"):
-        expert_file.load(saved.with_name("absent.npz"), "mocap")
+        expert_sets.load(saved.with_name("absent.npz"), "mocap")
 
 
 def test_sets_of_old_keep_their_hash(saved: Path) -> None:
@@ -149,9 +149,9 @@ def test_sets_of_old_keep_their_hash(saved: Path) -> None:
         for array in (split.positions, split.velocities, split.mode, split.continuations):
             digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(made.centre_lines.tobytes())
-    assert expert_file.load(saved).hash == made.hash == digest.hexdigest()
+    assert expert_sets.load(saved).hash == made.hash == digest.hexdigest()
     named = np.array(json.dumps({"environment": "yjunction", **parameters}))
-    assert expert_file.load(altered(saved, parameters=named), "yjunction").hash == made.hash
+    assert expert_sets.load(altered(saved, parameters=named), "yjunction").hash == made.hash
 
 
 def test_each_fault_of_a_mocap_set_is_named(mocap: ExpertSet, recorded: Path) -> None:
@@ -160,7 +160,7 @@ def test_each_fault_of_a_mocap_set_is_named(mocap: ExpertSet, recorded: Path) ->
     def check(pattern: str, **changes: np.ndarray | None) -> None:
         recorded.write_bytes(good)
         with pytest.raises(InputError, match=pattern) as caught:
-            expert_file.load(altered(recorded, **changes))
+            expert_sets.load(altered(recorded, **changes))
         assert str(recorded) in str(caught.value)
         assert "`ssmail prep-mocap --force`" in str(caught.value)
 
@@ -184,4 +184,4 @@ def test_each_fault_of_a_mocap_set_is_named(mocap: ExpertSet, recorded: Path) ->
 def test_an_environment_from_the_future(recorded: Path) -> None:
     altered(recorded, parameters=np.array('{"environment": "football"}'))
     with pytest.raises(InputError, match="is an expert set of 'football', which this ssmail does not know"):
-        expert_file.load(recorded)
+        expert_sets.load(recorded)

@@ -7,9 +7,7 @@ and for each split `positions`, `velocities` and `mode`. A yjunction set holds i
 training split, and the checksums of its `sources`. Nothing in it is pickled.
 """
 
-import contextlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,11 +17,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from ssmail.config.sections import LettersSpec, YJunctionSpec
-from ssmail.data import letters
+from ssmail.config.sections import DataSpec, LettersSpec, YJunctionSpec
+from ssmail.data import letters, yjunction
+from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
-from ssmail.data.yjunction import LANES, make_expert_set
 from ssmail.errors import InputError
 
 Contents = Mapping[str, Any]
@@ -75,6 +73,17 @@ class _File:
         return array
 
 
+def generate(data: DataSpec) -> ExpertSet:
+    """Generate the expert set of the environment whose parameters `data` has, one of config.spec.GENERATED.
+
+    Raises InputError for parameters that no set can have.
+    """
+    if data.letters is not None:
+        return letters.generate(data.letters)
+    assert data.yjunction is not None
+    return yjunction.generate(data.yjunction)
+
+
 def check_target(path: Path, *, force: bool) -> None:
     """Raise InputError when a set must not be written there."""
     if path.exists() and not force:
@@ -92,22 +101,17 @@ def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
         arrays |= _mocap_arrays(experts)
     else:
         arrays["centre_lines"] = experts.centre_lines
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez(  # compressed, such numbers are hardly smaller
-            temporary,
-            allow_pickle=False,
-            **arrays,
-            parameters=np.array(json.dumps(experts.parameters)),
-            hash=np.array(experts.hash),
-        )
-        temporary.replace(path)
+        with atomic_write(path) as partial, partial.open("wb") as file:
+            np.savez(  # compressed, such numbers are hardly smaller
+                file,
+                allow_pickle=False,
+                **arrays,
+                parameters=np.array(json.dumps(experts.parameters)),
+                hash=np.array(experts.hash),
+            )
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}; choose a writable --out") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
 
 
 def load(path: Path, environment: str | None = None) -> ExpertSet:
@@ -172,9 +176,9 @@ def _read_yjunction(file: _File) -> ExpertSet:
             file.array(f"{split}/positions", shape, np.float64),
             file.array(f"{split}/velocities", shape, np.float64),
             file.array(f"{split}/mode", (count,), np.int64),
-            file.array(f"{split}/continuations", (len(LANES), *shape), np.float64),
+            file.array(f"{split}/continuations", (len(yjunction.LANES), *shape), np.float64),
         )
-    return make_expert_set(splits, file.contents["centre_lines"], params)
+    return yjunction.make_expert_set(splits, file.contents["centre_lines"], params)
 
 
 def _read_letters(file: _File) -> ExpertSet:

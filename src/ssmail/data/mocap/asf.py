@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from ssmail.data.mocap.lines import AGAIN, Line, number, quoted, read_lines
+from ssmail.data.mocap.acclaim_lines import AGAIN, Line, number, quoted, read_lines
 from ssmail.errors import InputError
 
 ROOT = "root"

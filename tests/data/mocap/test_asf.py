@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ssmail.data.mocap.acclaim import MOST_BONES, Bone, Root, parse_skeleton
+from ssmail.data.mocap.asf import MOST_BONES, Bone, Root, parse_skeleton
 from ssmail.errors import InputError
 from tests.data.mocap.handmade import PERSON, B, asf, skeleton
 from tests.data.mocap.refusal import sentence_of

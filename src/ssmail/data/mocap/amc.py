@@ -14,10 +14,10 @@ import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ssmail.data.mocap.acclaim import CHANNELS, ROOT, Skeleton
-from ssmail.data.mocap.lines import LARGEST, Line, number, quoted, read_lines
+from ssmail.data.mocap.acclaim_lines import LARGEST, Line, number, quoted, read_lines
+from ssmail.data.mocap.asf import CHANNELS, ROOT, Skeleton
+from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 
 UNITS = {":degrees": True, ":deg": True, ":radians": False, ":rad": False}  # in degrees?
@@ -33,8 +33,8 @@ class Motion:
     """
 
     first: int
-    translation: NDArray[np.float64]
-    angles: NDArray[np.float64]
+    translation: Floats
+    angles: Floats
 
     def __len__(self) -> int:
         return len(self.angles)
@@ -149,7 +149,7 @@ class _Reader:
                     to[:, "xyz".index(meaning[1])] = column
         return Motion(self.first, translation, np.deg2rad(angles) if self.degrees else angles)
 
-    def values(self, channel: _Channel) -> NDArray[np.float64]:
+    def values(self, channel: _Channel) -> Floats:
         """(F, width) numbers of a channel. Raises InputError for the first word that is no sensible number."""
         values = np.empty(0)
         if "_" not in "".join(channel.words):  # which float() would take for a separator
