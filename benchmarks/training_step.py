@@ -27,8 +27,8 @@ from ssmail.config.spec import RunSpec
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
 from ssmail.models import message_passing
-from ssmail.training.learning import Setting
-from ssmail.training.replay import Batch
+from ssmail.training.batches import Batch
+from ssmail.training.learner import LearnerContext
 from ssmail.training.seeding import Generators
 from ssmail.training.variational import VariationalLearner
 
@@ -70,7 +70,7 @@ def make_learner(
     scaling = Scaling(position_min=-1.0, position_max=1.0, velocity_min=-1.0 / 3, velocity_max=1.0 / 3)
     experts = walkers(agents, steps)
     experts = Batch(experts.states.to(dtype), experts.actions.to(dtype), experts.source)
-    learner = VariationalLearner(Setting(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
+    learner = VariationalLearner(LearnerContext(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
     learner.model.to(dtype)
     update = learner._update
 
@@ -87,7 +87,7 @@ def make_learner(
 
 def one_step(learner: VariationalLearner) -> dict[str, float]:
     """A training step under complete teacher forcing; the metrics of the loss."""
-    return learner._update(torch.ones(learner.training.batch, learner.setting.steps, dtype=torch.bool))
+    return learner._update(torch.ones(learner.training.batch, learner.context.steps, dtype=torch.bool))
 
 
 def first_results(learner: VariationalLearner) -> dict[str, Tensor]:

@@ -47,13 +47,13 @@ def open_store(database: str) -> "Store":
 
     Raises InputError when the file is missing: reading must not make one.
     """
-    from ssmail.store import STALE_SECONDS, Store, is_alive
+    from ssmail.store import Store
 
     if is_missing(database):
         command = "ssmail train --method ssail --profile quick --seeds 0-4"
         raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
     store = Store.open(database)
-    if not all(is_alive(row, STALE_SECONDS) for row in store.runs(state="running")):
+    if not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()
     return store
@@ -70,12 +70,13 @@ def select_runs(
 ) -> "list[RunRow]":
     """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
     from ssmail.paper.results import FIGURES
+    from ssmail.plots.series import needed_by
     from ssmail.store import RunState
 
     if state is not None and state not in list(RunState):
         raise unknown_name("state", state, list(RunState))
-    if figure in FIGURES:
-        figure = FIGURES[figure].name  # experiments.yaml knows no aliases
-    return store.runs(
-        ids=ids or None, method=method, environment=environment, profile=profile, state=state, figure=figure
-    )
+    runs = store.runs(ids=ids or None, method=method, environment=environment, profile=profile, state=state)
+    if figure is None:
+        return runs
+    needed = needed_by(FIGURES[figure].name if figure in FIGURES else figure)  # experiments.yaml knows no aliases
+    return [run for run in runs if needed(run)]

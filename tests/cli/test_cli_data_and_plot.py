@@ -226,7 +226,7 @@ def test_nothing_is_drawn_before_all_options_are_parsed(cli: CommandLine, db: Pa
             "fig8 --env yjunction --profile quick",
             "run `ssmail ablate alpha --env yjunction --profile quick --seeds 0-4`.",
         ),
-        ("fig8", "no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
+        ("fig8", "no run of the ablation alpha on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
         ("fig9 --stat mean-ci", "`ssmail plot fig9` has no option --stat;"),
         ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
         ("fig10", "unknown figure 'fig10'; did you mean fig"),

@@ -7,10 +7,10 @@ from typing import Any
 
 import pytest
 
-from ssmail.execution.figure_cells import figure_cells
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.plots import provenance
 from ssmail.store import Store
+from ssmail_cli.reproduce import figure_cells
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
 from tests.data.mocap.handmade import write_subject
 from tests.paper.handmade_arrays import forecasts

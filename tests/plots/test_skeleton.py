@@ -14,7 +14,8 @@ from PIL import Image, ImageChops
 
 from ssmail.config.sections import YJunctionSpec
 from ssmail.data import expert_sets, yjunction
-from ssmail.data.mocap.dataset import MocapParameters, make_expert_set, make_trajectories
+from ssmail.data.mocap.dataset import MocapParameters, bundle
+from ssmail.data.trajectories import Trajectories
 from ssmail.errors import InputError
 from ssmail.plots import provenance, skeleton, style
 from ssmail.plots.saving import save_figure
@@ -42,10 +43,10 @@ def data(tmp_path: Path) -> Path:
         positions = np.concatenate([walk(window, 0), walk(window, 20)])
         velocities = np.gradient(positions, axis=1)
         frames = np.array([2, 2 + window])
-        splits[split] = make_trajectories(positions, velocities, np.array([number, number]), frames)
+        splits[split] = Trajectories.single_mode(positions, velocities, np.array([number, number]), frames)
     params = MocapParameters(subject=7, train=(1,), validation=(2,), test=(3,), window=5, test_window=9)
     path = tmp_path / "mocap.npz"
-    expert_sets.save(make_expert_set(splits, params, JOINTS, PARENTS, {}), path)
+    expert_sets.save(bundle(splits, params, JOINTS, PARENTS, {}), path)
     return path
 
 

@@ -107,13 +107,6 @@ def ablation_specs(
     return specs
 
 
-def ablation_hashes(name: str, environment: str | None = None, file: Path | None = None) -> list[str]:
-    """Return the hashes of the ablation's specs in every profile, in its own environment or another one."""
-    profiles = load_experiments(file).profiles
-    found = [ablation_specs(name, profile, file=file, environment=environment) for profile in profiles]
-    return [spec.hash() for specs in found for spec in specs.values()]
-
-
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
     """Return the runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
     experiments = load_experiments(file)

@@ -21,8 +21,7 @@ from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 from ssmail.data import expert_sets
-from ssmail.data.mocap.dataset import SPLITS
-from ssmail.data.trajectories import ExpertSet, Trajectories
+from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError, unknown_name
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance

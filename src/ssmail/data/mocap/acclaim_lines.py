@@ -1,4 +1,4 @@
-"""The lines of Acclaim's text files, and faults that name the file and the line."""
+"""Lines of Acclaim's text files, and errors that name the file and the line."""
 
 import math
 from collections.abc import Sequence
@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from ssmail.errors import InputError
 
-LARGEST = 1e9  # no number of a skeleton or a motion is larger
-LONGEST = 10_000  # characters of a line
+LARGEST = 1e9  # the largest number that a file may contain
+LONGEST = 10_000  # the longest line, in characters
 AGAIN = "get the file again from its source"
 
 
@@ -20,18 +20,18 @@ class Line:
     words: Sequence[str]
 
     def fault(self, what: str, remedy: str = AGAIN) -> InputError:
-        """The error to raise for this line."""
+        """Return the error to raise for this line."""
         return InputError(f"{self.file}, line {self.number}: {what}; {remedy}")
 
 
 def quoted(word: str) -> str:
-    """A word of a file as a message shows it: printable and not too long."""
+    """Quote a word of a file for a message: printable and not too long."""
     return repr(word if len(word) <= 24 else word[:21] + "...")
 
 
 def read_lines(contents: bytes, file: str) -> list[str]:
-    """The lines of a text file, whatever ends them. Raises InputError when it is empty, not text, or has a line that
-    no such file has.
+    """Split a text file into lines, with any line ends. Raises InputError if it is empty or not text, or if a line is
+    too long.
     """
     if not contents.strip():
         raise InputError(f"{file} is empty; {AGAIN}")
@@ -46,7 +46,7 @@ def read_lines(contents: bytes, file: str) -> list[str]:
 
 
 def number(line: Line, word: str) -> float:
-    """The value of a word. Raises InputError unless it is a finite decimal number of a sensible size."""
+    """Parse a word. Raises InputError unless it is a finite decimal number of at most LARGEST."""
     try:
         value = math.nan if "_" in word else float(word)
     except ValueError:

@@ -1,13 +1,16 @@
-"""Acclaim motions: the text of an .amc file, read strictly against the skeleton that it moves.
+"""Strict parser for Acclaim motions (.amc files), given the skeleton that they move.
 
-A frame is its number on a line of its own and then a line for each joint: the name, and a number for each dof, in the
-order of the skeleton file. The lines of a frame may come in any order. Frames are numbered without gaps, from any
-first number.
+A frame is a line with its number and then a line for each joint, in any order: the name, and a number for each dof, in
+the order of the skeleton file. Frames are numbered without gaps, from any first number.
 
 Angles are in the unit of `:DEGREES` or `:RADIANS`, else in that of the skeleton file. `:FULLY-SPECIFIED`, which all
-files of the CMU database have, promises that every frame names every joint: a joint that is missing is an error.
-Without that keyword it keeps its rest pose in that frame, as in the players of the CMU (angles zero); only the root
-can never be missing.
+files of the CMU database have, promises that every frame names every joint, so a missing joint is an error. Without
+that keyword a missing joint keeps its rest pose in that frame (angles zero), as in CMU's players; the root must never
+be missing.
+
+The reader collects words, not numbers: each joint has a `_Channel` that grows by the words of every frame, and all of
+its words are converted at once at the end. That is several times faster than parsing line by line. The line numbers are
+kept so that an error in a number can still name its line.
 """
 
 import itertools
@@ -20,7 +23,7 @@ from ssmail.data.mocap.asf import CHANNELS, ROOT, Skeleton
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 
-UNITS = {":degrees": True, ":deg": True, ":radians": False, ":rad": False}  # in degrees?
+UNITS = {":degrees": True, ":deg": True, ":radians": False, ":rad": False}  # keyword -> whether it means degrees
 COMPLETE = ":fully-specified"
 
 
@@ -28,8 +31,8 @@ COMPLETE = ":fully-specified"
 class Motion:
     """F frames of a skeleton with N joints.
 
-    first: number of the first frame. translation: (F, 3) of the root, file units. angles: (F, N, 3) radians about the
-    local x, y, z of each joint, zero where it has no such dof; those of the root are about the global axes.
+    first: number of the first frame. translation: (F, 3), of the root, in file units. angles: (F, N, 3), in radians
+    about the local x, y, z of each joint (the root's about the global axes), zero where the joint has no such dof.
     """
 
     first: int
@@ -42,7 +45,10 @@ class Motion:
 
 @dataclass
 class _Channel:
-    """What is read of one joint: the words of all frames, the line of each frame, and the last frame that named it."""
+    """One joint: the words of all frames, the line of each frame, and the last frame that named the joint.
+
+    width: its numbers in a frame.
+    """
 
     width: int
     words: list[str] = field(default_factory=list)
@@ -51,7 +57,7 @@ class _Channel:
 
 
 def parse_motion(contents: bytes, file: str, skeleton: Skeleton) -> Motion:
-    """The motion of an .amc file; `file` is its name in messages. Raises InputError naming the file and the line."""
+    """Parse an .amc file; `file` is its name in messages. Raises InputError that names the file and the line."""
     reader = _Reader(file, skeleton)
     for at, line in enumerate(read_lines(contents, file), start=1):
         words = line.partition("#")[0].split()
@@ -67,7 +73,7 @@ def parse_motion(contents: bytes, file: str, skeleton: Skeleton) -> Motion:
 
 
 class _Reader:
-    """Takes the lines of a motion one by one."""
+    """Reads the lines of a motion one by one: `begin` a frame, `add` a joint to it, `head` for all other lines."""
 
     def __init__(self, file: str, skeleton: Skeleton) -> None:
         self.file, self.skeleton = file, skeleton
@@ -79,7 +85,7 @@ class _Reader:
         self.begun, self.named = 0, 0  # line of the current frame's number; moving joints that it has named
 
     def begin(self, at: int, word: str) -> None:
-        """A frame's number."""
+        """Begin the frame whose number is on this line."""
         self.check_frame()
         value = int(word) if len(word) < 10 else -1
         if self.frame < 0:
@@ -90,7 +96,7 @@ class _Reader:
         self.frame, self.begun, self.named = self.frame + 1, at, 0
 
     def add(self, at: int, words: list[str]) -> None:
-        """A joint's line of the current frame."""
+        """Add a joint's line to the current frame."""
         channel = self.channels[words[0]]
         if len(words) != channel.width + 1:
             numbers = f"{len(words) - 1} {'number' if len(words) == 2 else 'numbers'}"
@@ -106,12 +112,12 @@ class _Reader:
         channel.last = self.frame
 
     def rest(self, channel: _Channel, frames: int) -> None:
-        """Frames that did not name the joint."""
+        """Fill in zeros for frames that did not name the joint."""
         channel.words += itertools.repeat("0", frames * channel.width)
         channel.lines += itertools.repeat(self.begun, frames)
 
     def head(self, at: int, words: list[str]) -> None:
-        """A line that is no part of a frame."""
+        """Read a line that is neither a frame number nor a joint of a frame: a keyword, or an error."""
         keyword, line = words[0].lower(), self.line(at)
         if self.frame < 0 and keyword.startswith(":"):
             self.complete |= keyword == COMPLETE
@@ -125,7 +131,7 @@ class _Reader:
             raise line.fault(f"the skeleton has no joint {quoted(words[0])}", remedy)
 
     def check_frame(self) -> None:
-        """Whether the current frame is whole."""
+        """Raise InputError if the current frame lacks a joint."""
         if self.frame < 0 or self.named == self.moving:
             return
         for name, channel in self.channels.items():
@@ -133,7 +139,7 @@ class _Reader:
                 raise self.line(self.begun).fault(f"frame {self.first + self.frame} lacks {quoted(name)}")
 
     def motion(self) -> Motion:
-        """What was read, as arrays."""
+        """Finish the last frame and convert the words to arrays."""
         self.check_frame()
         if self.frame < 0:
             raise InputError(f"{self.file} holds no frame; is it an .amc file?")
@@ -150,7 +156,7 @@ class _Reader:
         return Motion(self.first, translation, np.deg2rad(angles) if self.degrees else angles)
 
     def values(self, channel: _Channel) -> Floats:
-        """(F, width) numbers of a channel. Raises InputError for the first word that is no sensible number."""
+        """Convert a channel to numbers (F, width). Raises InputError for the first word that is not a valid number."""
         values = np.empty(0)
         if "_" not in "".join(channel.words):  # which float() would take for a separator
             try:
@@ -163,5 +169,5 @@ class _Reader:
         return values.reshape(-1, channel.width)
 
     def line(self, at: int) -> Line:
-        """Where a fault is."""
+        """Return a line by its number, to raise an error for it."""
         return Line(self.file, at, ())

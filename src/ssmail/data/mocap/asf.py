@@ -1,11 +1,14 @@
-"""Acclaim skeletons: the text of an .asf file, read strictly.
+"""Strict parser for Acclaim skeletons (.asf files).
 
-What an .asf file says (format definition 1.10 by Acclaim, 1995, and CMU's notes on it): a root that the motion moves,
-bones that begin where their parent ends, and who hangs on whom. Directions and local axes are those of the rest pose,
-in global coordinates. A fault of the file is one sentence that names the file and the line.
+An .asf file (format 1.10 by Acclaim, 1995, and CMU's notes on it) describes a root that the motion moves, bones that
+begin where their parent ends, and the hierarchy. Directions and local axes are those of the rest pose, in global
+coordinates. Every error is one sentence that names the file and the line.
 
-Read but not applied: the limits of the joints (motions are recorded within them) and the length unit (positions stay in
-the file's own numbers, as everybody uses these data). Sections and entries that this module does not know are skipped.
+The limits of the joints (motions are recorded within them) and the length unit (by custom, positions stay in the file's
+own units) are parsed but not applied. Unknown sections and entries are skipped.
+
+`parse_skeleton` works in three steps: split the file into its sections; parse the units, the root and the bones;
+connect the bones through the hierarchy.
 """
 
 import math
@@ -20,17 +23,17 @@ CHANNELS = ("tx", "ty", "tz", "rx", "ry", "rz")
 ORDERS = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
 MOST_BONES = 1000
 _WHITE = str.maketrans("(),", "   ")
-_ENDLESS = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}  # what limits may be
+_INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}  # allowed as limits
 
 Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Root:
-    """Where the skeleton stands before it moves.
+    """The root in the rest pose.
 
-    position: in file units. orientation: radians about x, y, z, applied in the order `axis_order`. order: what the
-    numbers of a frame mean, of CHANNELS; its rotations are applied in that order, about fixed global axes.
+    position: in file units. orientation: radians about x, y, z, applied in the order `axis_order`. order: the CHANNELS
+    that the numbers of a frame stand for; its rotations are applied in that order, about fixed global axes.
     """
 
     position: Vector
@@ -43,10 +46,10 @@ class Root:
 class Bone:
     """One bone in the rest pose.
 
-    direction: of unit length up to the rounding of the file, global. length: file units. axis: orientation of the local
+    direction: global unit vector, up to the rounding of the file. length: in file units. axis: orientation of the local
     axes, radians about the global x, y, z, applied in the order `axis_order`, which is also the order of the joint's
-    own rotations. dof: the rotations that the joint has, in the order of their numbers in a frame. limits: radians,
-    one pair for each dof, or none at all.
+    own rotations. dof: the rotations of the joint, in the order of their numbers in a frame. limits: (low, high) in
+    radians for each dof, or empty.
     """
 
     name: str
@@ -62,8 +65,9 @@ class Bone:
 class Skeleton:
     """Root and bones, in the order of the file.
 
-    Joint 0 is the root, joint j + 1 the end of bones[j]. parents: of each joint, -1 for the root. top_down: all joints,
-    each after its parent. length_unit: the multiplier in the file's head. degrees: the file's unit of angles.
+    Joint 0 is the root, joint j + 1 the end of bones[j]. parents: the parent of each joint, -1 for the root. top_down:
+    all joints, each after its parent. length_unit: the multiplier in the file's header. degrees: whether the file's
+    angles are in degrees.
     """
 
     root: Root
@@ -75,20 +79,23 @@ class Skeleton:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """The names of the N joints, the root first."""
+        """Names of the N joints, the root first."""
         return (ROOT, *(bone.name for bone in self.bones))
 
 
 def parse_skeleton(contents: bytes, file: str) -> Skeleton:
-    """The skeleton of an .asf file; `file` is its name in messages. Raises InputError naming the file and the line."""
+    """Parse an .asf file; `file` is its name in messages. Raises InputError that names the file and the line."""
+    # sections
     sections = _sections(contents, file)
     for needed in (":root", ":bonedata", ":hierarchy"):
         if needed not in sections:
-            raise InputError(f"{file} has no section {needed}, so it is no whole .asf file; {AGAIN}")
+            raise InputError(f"{file} has no section {needed}, so it is not a complete .asf file; {AGAIN}")
+    # units and bones
     length_unit, degrees = _units(sections.get(":units", []))
     scale = math.pi / 180 if degrees else 1.0
     named = _bones(sections[":bonedata"], scale)
     bones = tuple(bone for bone, _ in named.values())
+    # hierarchy
     parents = _parents(sections[":hierarchy"][1:], named)
     joints = {name: joint for joint, name in enumerate((ROOT, *named))}
     return Skeleton(
@@ -102,7 +109,7 @@ def parse_skeleton(contents: bytes, file: str) -> Skeleton:
 
 
 def _sections(contents: bytes, file: str) -> dict[str, list[Line]]:
-    """Keyword -> its line, then the lines below it that hold words."""
+    """Map each section's keyword to its line and the non-empty lines below it."""
     sections: dict[str, list[Line]] = {}
     current: list[Line] | None = None
     for at, text in enumerate(read_lines(contents, file), start=1):
@@ -122,7 +129,7 @@ def _sections(contents: bytes, file: str) -> dict[str, list[Line]]:
 
 
 def _units(section: Sequence[Line]) -> tuple[float, bool]:
-    """Length unit and whether angles are in degrees, as they are unless the file says otherwise."""
+    """Return the length unit (default 1) and whether angles are in degrees (default True)."""
     length, degrees = 1.0, True
     for line in section[1:]:
         key, words = line.words[0].lower(), line.words[1:]
@@ -159,7 +166,7 @@ def _root(section: Sequence[Line], scale: float) -> Root:
 
 
 def _bones(section: Sequence[Line], scale: float) -> dict[str, tuple[Bone, Line]]:
-    """Name -> bone and the line that names it, in the order of the file."""
+    """Map each name to its bone and the line that names it, in the order of the file."""
     bones: dict[str, tuple[Bone, Line]] = {}
     for begin, entries in _blocks(section[1:]):
         line = entries.get("name")
@@ -179,7 +186,10 @@ def _bones(section: Sequence[Line], scale: float) -> dict[str, tuple[Bone, Line]
 
 
 def _blocks(lines: Iterable[Line]) -> Iterator[tuple[Line, dict[str, Line]]]:
-    """The line of each `begin`, and the entries up to its `end`; limits go on over lines that begin with a number."""
+    """Yield the line of each `begin` and the entries up to its `end`.
+
+    Lines that begin with a number continue the entry `limits`.
+    """
     begin: Line | None = None
     entries: dict[str, Line] = {}
     last = ""
@@ -194,7 +204,7 @@ def _blocks(lines: Iterable[Line]) -> Iterator[tuple[Line, dict[str, Line]]]:
         elif key == "end":
             yield begin, entries
             begin = None
-        elif last == "limits" and (key in _ENDLESS or key.lstrip("+-")[:1] in tuple(".0123456789")):
+        elif last == "limits" and (key in _INFINITE or key.lstrip("+-")[:1] in tuple(".0123456789")):
             first = entries[last]
             if len(first.words) > 2 * len(CHANNELS):
                 raise line.fault("there are more limits than a bone can have")
@@ -238,7 +248,7 @@ def _limits(line: Line, count: int, scale: float) -> tuple[tuple[float, float], 
     words = line.words[1:]
     if len(words) != 2 * count:
         raise line.fault(f"limits has {len(words)} numbers for {count} dof, which need {2 * count}")
-    values = [_ENDLESS[w.lower()] if w.lower() in _ENDLESS else number(line, w) * scale for w in words]
+    values = [_INFINITE[w.lower()] if w.lower() in _INFINITE else number(line, w) * scale for w in words]
     pairs = tuple(zip(values[::2], values[1::2], strict=True))
     if any(low > high for low, high in pairs):
         raise line.fault("a lower limit is above its upper limit")
@@ -246,7 +256,7 @@ def _limits(line: Line, count: int, scale: float) -> tuple[tuple[float, float], 
 
 
 def _parents(lines: Iterable[Line], bones: Mapping[str, tuple[Bone, Line]]) -> dict[str, Line]:
-    """Bone -> the line of the hierarchy that hangs it on its parent, the first word of that line."""
+    """Map each bone to its line in the hierarchy, whose first word is the parent and whose other words are children."""
     parents: dict[str, Line] = {}
     unclosed: Line | None = None
     for line in lines:
@@ -273,7 +283,7 @@ def _parents(lines: Iterable[Line], bones: Mapping[str, tuple[Bone, Line]]) -> d
 
 
 def _top_down(parents: Mapping[str, Line]) -> list[str]:
-    """All joints, each after its parent. Raises InputError for bones that hang on one another in a circle."""
+    """Return all joints, each after its parent. Raises InputError if bones form a cycle."""
     children: dict[str, list[str]] = {}
     for name, line in parents.items():
         children.setdefault(line.words[0], []).append(name)

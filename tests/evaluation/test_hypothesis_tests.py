@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest, mannwhitneyu
 
-from ssmail.evaluation.order_statistics import (
+from ssmail.evaluation.hypothesis_tests import (
     ALPHA,
     deviations,
     median,

@@ -1,28 +1,24 @@
-"""Predictors that need no training: what every learned one has to beat."""
+"""Baselines that need no training: constant velocity, and copies of the last state."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ssmail.envs.integrator import Integrator
+from ssmail.training.learner import Stateful
 
 
-class Stateless:
-    """Has nothing to save."""
+class Baseline:
+    """A deterministic predictor without weights."""
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
-        return {}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
+    model = nn.Module()
 
 
 @dataclass(frozen=True)
-class ConstantVelocity(Stateless):
-    """Every agent takes the velocity that is read of the state it is predicted from."""
+class ConstantVelocity(Baseline):
+    """Every agent keeps the velocity that it reads in the current state."""
 
     integrator: Integrator
 
@@ -51,8 +47,8 @@ class ConstantVelocity(Stateless):
 
 
 @dataclass(frozen=True)
-class CopyLast(Stateless):
-    """Every state, velocities included, is the last observed one as it was read."""
+class CopyLast(Baseline):
+    """Every predicted state, velocities included, is a copy of the last observed state as it was read."""
 
     def free_run(
         self,
@@ -73,16 +69,20 @@ class CopyLast(Stateless):
         return states[:, :-1]
 
 
-class NothingToLearn(Stateless):
-    """The learner of a reference."""
+class BaselineLearner:
+    """The learner of a baseline, which has nothing to train."""
 
     def __init__(self, predictor: ConstantVelocity | CopyLast) -> None:
         self.predictor = predictor
 
-    def networks(self) -> list[torch.nn.Module]:
-        """None."""
+    def networks(self) -> list[nn.Module]:
+        """Return no networks."""
         return []
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
-        """Never called: the spec of a reference has no training epochs."""
-        raise NotImplementedError("a reference has nothing to learn")
+        """Raise NotImplementedError: the spec of a baseline has no training epochs."""
+        raise NotImplementedError("a baseline has nothing to learn")
+
+    def parts(self) -> Mapping[str, Stateful]:
+        """Return nothing to save."""
+        return {}

@@ -9,7 +9,8 @@ import pytest
 from ssmail.config.experiments import ablation, ablation_specs, build_spec
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns
-from ssmail.plots.ablation_selection import rest_of, select_ablation, value_of
+from ssmail.plots.run_groups import rest_of, value_of
+from ssmail.plots.series import select
 from ssmail.store import RunState, Store
 
 OTHER = ["sac.gamma=0.5"]
@@ -18,7 +19,7 @@ COMMAND = "`ssmail ablate beta --profile smoke --seeds 0-4`"
 
 
 def chosen(store: Store, ids: list[str] | None = None, figure: str = "fig6") -> dict[Any, list[str]]:
-    return {group.value: [run.id for run in group.runs] for group in select_ablation(store, figure, ids).groups}
+    return {group.value: [run.id for run in group.runs] for group in select(store, figure, ids).groups}
 
 
 def test_the_family_of_experiments_yaml_is_drawn_and_others_are_not(store: Store, add_run: Any, ablate: Any) -> None:
@@ -48,7 +49,7 @@ def test_values_of_ones_own_belong_to_it_and_are_in_rising_order(store: Store, a
     family = ablate("beta", {1.0: [0.1], own: [0.2], 0.0: [0.3]})
     assert list(chosen(store)) == [0.0, own, 1.0]
     assert chosen(store) == family
-    assert [group.label for group in select_ablation(store, "fig6").groups] == ["0", str(own), "1"]
+    assert [group.label for group in select(store, "fig6").groups] == ["0", str(own), "1"]
 
 
 def test_words_are_in_the_order_of_experiments_yaml(store: Store, ablate: Any) -> None:
@@ -76,7 +77,7 @@ def test_without_it_the_family_with_most_values_times_seeds_is_drawn(store: Stor
     most = ablate("beta", {0.0: [0.1, 0.2], 0.5: [0.3, 0.3]}, ANOTHER)
     ablate("beta", {0.5: [0.1] * 5}, ["sac.gamma=0.7"])  # many seeds of one value are no ablation
     assert chosen(store) == most
-    (note,) = select_ablation(store, "fig6").notes
+    (note,) = select(store, "fig6").notes
     assert note == (
         "ablation beta: runs of ssail (profile smoke), 2 values, seeds 0, 1; they differ in curriculum.beta alone, but "
         "are not what experiments.yaml gives now."
@@ -88,33 +89,33 @@ def test_a_profile_can_be_asked_for(store: Store, add_run: Any, ablate: Any) -> 
     quick = ablation_specs("beta", "quick", values=[0.0, 1.0])
     full = {value: [add_run(0, spec=spec)] for value, spec in quick.items()}
     assert chosen(store) == full
-    selection = select_ablation(store, "fig6", profile="smoke")
+    selection = select(store, "fig6", profile="smoke")
     assert [run.id for run in selection.runs] == small[0.0]
     with pytest.raises(NoRuns, match=r"of profile paper; run `ssmail ablate beta --profile paper --seeds 0-4`\.$"):
-        select_ablation(store, "fig6", profile="paper")
+        select(store, "fig6", profile="paper")
 
 
 def test_what_is_missing_is_said_with_the_command(store: Store, ablate: Any) -> None:
     first, second, *rest = ablation("beta").values
     ablate("beta", {first: [0.1] * 3, second: [0.1, 0.2]})
-    drawn, missing = select_ablation(store, "fig6").notes
+    drawn, missing = select(store, "fig6").notes
     assert drawn == "ablation beta: runs of ssail (profile smoke), 2 values, seeds 0, 1, 2."
     others = ", ".join(f"{value:g}" for value in rest)
     assert missing == f"missing of curriculum.beta: {second:g} (seed 2), {others}; {COMMAND} computes what is missing."
     ablate("beta", {value: [0.1] * 3 for value in ablation("beta").values})
-    assert len(select_ablation(store, "fig6").notes) == 1
+    assert len(select(store, "fig6").notes) == 1
 
 
 def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) -> None:
     with pytest.raises(NoRuns) as empty:
         chosen(store)
     assert str(empty.value) == (
-        f"fig6 has nothing to draw: {store.where} holds no run of it on yjunction; run "
+        f"fig6 has nothing to draw: {store.where} holds no run of the ablation beta on yjunction; run "
         "`ssmail ablate beta --profile quick --seeds 0-4`."
     )
     add_run(0, overrides=OTHER)  # one spec alone is no ablation
     add_run(0, state=RunState.INTERRUPTED)
-    with pytest.raises(NoRuns, match="holds no finished run of it"):
+    with pytest.raises(NoRuns, match="holds no finished run of the ablation beta"):
         chosen(store)
 
 

@@ -12,12 +12,17 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.models.features import Features
 from ssmail.models.normalization import Normalization
-from ssmail.training import landscapes
-from ssmail.training.landscapes import Landscapes, Moments, current_epoch, looks, position_gradient
-from ssmail.training.learning import Setting
+from ssmail.training.baselines import ConstantVelocity
+from ssmail.training.batches import Batch
+from ssmail.training.landscape_recorder import (
+    LandscapeRecorder,
+    RewardInputs,
+    current_epoch,
+    landscape_epochs,
+    position_gradient,
+)
+from ssmail.training.learner import LearnerContext
 from ssmail.training.loop import TrainingLoop
-from ssmail.training.references import ConstantVelocity
-from ssmail.training.replay import Batch
 
 from .conftest import ToySpec
 
@@ -36,10 +41,10 @@ class Handmade:
         self.reward, self.features, self.predictor = reward, features, ConstantVelocity(loop.integrator)
 
 
-def looking(loop: TrainingLoop, reward: Reward) -> Landscapes:
+def looking(loop: TrainingLoop, reward: Reward) -> LandscapeRecorder:
     """At a handmade reward."""
     assert loop.landscapes is not None
-    return Landscapes(loop.landscapes.setting, Handmade(loop, reward, Features(False, False, 50)))
+    return LandscapeRecorder(loop.landscapes.context, Handmade(loop, reward, Features(False, False, 50)))
 
 
 def linear(x: Tensor, actions: Tensor) -> Tensor:
@@ -54,8 +59,8 @@ def test_the_gradient_is_of_the_agents_own_position_alone(loop: TrainingLoop) ->
 
     states = torch.randn(2, 4, 3, 4)
     learner = Handmade(loop, reward, Features(True, True, 4))
-    at = Moments.of(learner.features, states, torch.zeros(2, 3, 3, 2))
-    assert at.beside.shape == (2, 3, 3, 1 + 4)  # the step and the first state
+    at = RewardInputs.from_trajectories(learner.features, states, torch.zeros(2, 3, 3, 2))
+    assert at.other_features.shape == (2, 3, 3, 1 + 4)  # the step and the first state
     values, gradient = position_gradient(learner, at, 1)
     expected = torch.stack([2 * states[:, :-1, 1, 0], torch.full((2, 3), 5.0)], dim=-1)
     torch.testing.assert_close(gradient, expected)
@@ -67,7 +72,7 @@ def test_the_gradient_is_in_scaled_units_whatever_the_networks_read(loop: Traini
     plain = Features(False, False, 50)
     features = replace(plain, normalization=Normalization.fit(states))
     learner = Handmade(loop, lambda x, actions: x[..., 0], features)
-    _, gradient = position_gradient(learner, Moments.of(features, states, loop.experts.actions), 2)
+    _, gradient = position_gradient(learner, RewardInputs.from_trajectories(features, states, loop.experts.actions), 2)
     expected = 1 / Normalization.fit(states).std[2, 0]
     torch.testing.assert_close(gradient[..., 0].max(), expected)
     assert expected != 1
@@ -75,7 +80,7 @@ def test_the_gradient_is_in_scaled_units_whatever_the_networks_read(loop: Traini
 
 def test_a_linear_reward_is_a_plane_with_share_1(loop: TrainingLoop) -> None:
     look = looking(loop, linear)
-    _, gradient = look.field()
+    _, gradient = look.reward_field()
     np.testing.assert_allclose(gradient, np.broadcast_to([3.0, -4.0], gradient.shape), atol=1e-5)
     assert values_of(look)["landscape/slope_share"] == 1
 
@@ -87,10 +92,12 @@ def test_a_reward_of_the_distance_has_cosine_1_and_its_opposite_minus_1(loop: Tr
         return -(x[..., :2] - middle).norm(dim=-1)
 
     look = looking(loop, towards)
-    look.ways = np.broadcast_to(middle.numpy() - look.plane.points, look.ways.shape)  # an expert that stands there
+    look.to_expert = np.broadcast_to(
+        middle.numpy() - look.plane.points, look.to_expert.shape
+    )  # an expert that stands there
     assert values_of(look)["landscape/cosine"] == pytest.approx(1, abs=1e-5)
     away = looking(loop, lambda x, actions: -towards(x, actions))
-    away.ways = look.ways
+    away.to_expert = look.to_expert
     assert values_of(away)["landscape/cosine"] == pytest.approx(-1, abs=1e-5)
 
 
@@ -99,7 +106,7 @@ def test_the_reference_is_an_expert_state_that_is_near(loop: TrainingLoop) -> No
         return x[..., 3] + 10 * actions[..., 1]
 
     look = looking(loop, speed)
-    reward, gradient = look.field()
+    reward, gradient = look.reward_field()
     assert not gradient.any()
     for agent in range(3):
         at = look.references.states[:, agent]
@@ -113,31 +120,33 @@ def test_the_reference_is_an_expert_state_that_is_near(loop: TrainingLoop) -> No
     assert reward.min() < reward.max()
 
 
-def values_of(look: Landscapes) -> dict[str, float]:
-    values, _ = look.look(3)
+def values_of(look: LandscapeRecorder) -> dict[str, float]:
+    values, _ = look.record(3)
     return values
 
 
 def test_around_the_current_trajectory_a_reward_towards_the_expert_has_cosine_1(loop: TrainingLoop) -> None:
     look, made = beside(looking(loop, lambda x, actions: -x[..., 1].abs()), loop)
-    values, arrays = look.around(made)
+    values, arrays = look.vector_field(made)
     assert values["landscape/behind_cosine"] > 0.9  # not 1 where the nearest expert is further along
     opposite, _ = beside(looking(loop, lambda x, actions: x[..., 1].abs()), loop)
-    assert opposite.around(made)[0]["landscape/behind_cosine"] == pytest.approx(-values["landscape/behind_cosine"])
+    assert opposite.vector_field(made)[0]["landscape/behind_cosine"] == pytest.approx(
+        -values["landscape/behind_cosine"]
+    )
     alpha, current, expert = (arrays[f"vector_field/{name}"] for name in ("alpha", "current", "expert"))
     assert (alpha.min(), alpha.max()) == (-1, 0.875)
     assert arrays["vector_field/gradient"].shape == (16, *current.shape)
     assert current.shape == expert.shape == (8, 49, 3, 2)
 
 
-def beside(look: Landscapes, loop: TrainingLoop) -> tuple[Landscapes, Tensor]:
+def beside(look: LandscapeRecorder, loop: TrainingLoop) -> tuple[LandscapeRecorder, Tensor]:
     """The same with experts on y = 0, and eight rollouts beside the first of them on y = 0.9, all the way."""
     experts = loop.experts.states.clone()
     experts[..., 1] = 0.0
     made = experts[:8].clone()
     made[..., 1] = 0.9
     known = Batch(experts, loop.experts.actions, loop.experts.source)
-    look.setting = Setting(look.setting.spec, known, loop.integrator, loop.generators)
+    look.context = LearnerContext(look.context.spec, known, loop.integrator, loop.generators)
     return look, made
 
 
@@ -151,7 +160,7 @@ def test_a_field_that_only_knows_what_lies_ahead_is_told_from_one_that_knows_wha
         return torch.where(y > 0.9, y - 0.9, 0.9 - y)  # highest on the expert and as far on the other side
 
     look, made = beside(looking(loop, cut), loop)
-    values, _ = look.around(made)
+    values, _ = look.vector_field(made)
     assert values["landscape/ahead_cosine"] > 0.7
     assert values["landscape/behind_cosine"] < -0.9
 
@@ -160,11 +169,11 @@ def test_when_it_is_looked_at() -> None:
     def spec(epochs: int, kept: str) -> RunSpec:
         return build_spec("ssail", "yjunction", "smoke", [f"training.epochs={epochs}", f"evaluation.landscapes={kept}"])
 
-    assert looks(spec(40, "null")) == (0, 20, 40)
-    assert looks(spec(40, "4")) == (0, 10, 20, 30, 40)
-    assert looks(spec(3, "12")) == (0, 1, 2, 3)
-    assert looks(spec(1, "null")) == (0, 1)
-    assert looks(spec(40, "3")) == (0, 13, 20, 27, 40)
+    assert landscape_epochs(spec(40, "null")) == (0, 20, 40)
+    assert landscape_epochs(spec(40, "4")) == (0, 10, 20, 30, 40)
+    assert landscape_epochs(spec(3, "12")) == (0, 1, 2, 3)
+    assert landscape_epochs(spec(1, "null")) == (0, 1)
+    assert landscape_epochs(spec(40, "3")) == (0, 13, 20, 27, 40)
     assert current_epoch(spec(80, "null")) == 40
 
 
@@ -188,7 +197,7 @@ def test_looking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         return kept, [p.detach() for network in loop.learner.networks() for p in network.parameters()]
 
     seen = trained()
-    monkeypatch.setattr(landscapes.Landscapes, "of", lambda *_: None)
+    monkeypatch.setattr(LandscapeRecorder, "for_learner", lambda *_: None)
     unseen = trained()
     assert seen[0] == unseen[0]
     assert all(torch.equal(a, b) for a, b in zip(seen[1], unseen[1], strict=True))

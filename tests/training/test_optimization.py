@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ssmail.training.updates import clipped_step, mean_of, with_noise
+from ssmail.training.optimization import add_noise, clipped_step, mean_metrics
 
 
 @pytest.mark.parametrize(("limit", "norm"), [(1.0, 1.0), (100.0, 5.0)])
@@ -19,13 +19,13 @@ def test_a_step_goes_down_a_gradient_of_limited_norm(limit: float, norm: float) 
 def test_noise_has_its_size_and_none_is_drawn_for_nothing() -> None:
     x, generator = torch.zeros(40_000), torch.Generator().manual_seed(0)
     before = generator.get_state()
-    assert with_noise(x, 0, generator) is x
+    assert add_noise(x, 0, generator) is x
     assert torch.equal(generator.get_state(), before)
-    noisy = with_noise(x, 0.1, generator)
+    noisy = add_noise(x, 0.1, generator)
     assert float(noisy.std()) == pytest.approx(0.1, rel=0.02)
     assert abs(float(noisy.mean())) < 0.002
     assert not torch.equal(generator.get_state(), before)
 
 
 def test_means_of_records() -> None:
-    assert mean_of([{"a": 1.0, "b": math.inf}, {"a": 4.0, "b": 0.0}]) == {"a": 2.5, "b": math.inf}
+    assert mean_metrics([{"a": 1.0, "b": math.inf}, {"a": 4.0, "b": 0.0}]) == {"a": 2.5, "b": math.inf}

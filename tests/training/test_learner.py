@@ -1,11 +1,11 @@
-"""What every method's predictor promises (`ssmail.training.learning.Predictor`), untrained, on recorded motion."""
+"""What every method's predictor promises (`ssmail.training.learner.Predictor`), untrained, on recorded motion."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from ssmail.config.spec import METHODS
-from ssmail.training.learning import Predictor
+from ssmail.training.learner import Predictor
 from ssmail.training.loop import TrainingLoop
 from tests.training.conftest import ToySpec
 
@@ -96,6 +96,6 @@ def test_one_step_predictions_read_the_past_only(loop: TrainingLoop) -> None:
 def test_weights_are_saved_and_read_back(loop: TrainingLoop, toy: ToySpec) -> None:
     fresh = TrainingLoop(loop.spec, 1)
     before = free_run(fresh)
-    fresh.learner.predictor.load_state_dict(loop.learner.predictor.state_dict())
+    fresh.learner.predictor.model.load_state_dict(loop.learner.predictor.model.state_dict())
     assert torch.equal(free_run(fresh), free_run(loop))
     assert torch.equal(before, free_run(loop)) is (not loop.spec.epochs)  # other weights, other motion

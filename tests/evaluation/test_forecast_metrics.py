@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats
-from ssmail.evaluation.protocol import STEPS, forecast_metrics, letter_metrics
+from ssmail.evaluation.metrics import FORECAST_STEPS, forecast_metrics, letter_metrics
 
 SCALING = Scaling(0.0, 10.0, -1.0, 1.0)  # one scaled unit of position is five raw ones
 S, B, T, N = 2, 2, 3, 1
@@ -85,8 +85,8 @@ def test_steps_have_metrics_of_their_own_as_far_as_there_are_so_many(steps: int,
     draw = np.random.default_rng(seed)
     predicted, truth = draw.normal(size=(2, 3, steps, 2, 4)), draw.normal(size=(3, steps, 2, 4))
     values, curves = forecast_metrics(predicted, truth, SCALING)
-    assert {name for name in values if name.startswith("mse_")} == {f"mse_{h}" for h in STEPS if h <= steps}
-    assert all(values[f"mse_{h}"] == curves["mse"][h - 1] for h in STEPS if h <= steps)
+    assert {name for name in values if name.startswith("mse_")} == {f"mse_{h}" for h in FORECAST_STEPS if h <= steps}
+    assert all(values[f"mse_{h}"] == curves["mse"][h - 1] for h in FORECAST_STEPS if h <= steps)
     assert values["mse"] == pytest.approx(np.square(predicted - truth).mean())
     perfect, _ = forecast_metrics(truth[None], truth, SCALING)
     assert set(perfect.values()) == {0.0}

@@ -6,7 +6,7 @@ import pytest
 
 from ssmail.config.experiments import FigureRequirements, build_spec
 from ssmail.errors import InputError
-from ssmail.plots import NoRuns, selection
+from ssmail.plots import NoRuns, series
 from ssmail.store import RunState, Store
 
 OTHER = ["sac.gamma=0.5"]
@@ -14,7 +14,7 @@ ANOTHER = ["sac.gamma=0.6"]
 
 
 def chosen(store: Store, ids: list[str] | None = None) -> dict[str, list[str]]:
-    return {group.label: [run.id for run in group.runs] for group in selection.select(store, "fig4", ids).groups}
+    return {group.label: [run.id for run in group.runs] for group in series.select(store, "fig4", ids).groups}
 
 
 def test_the_spec_of_experiments_yaml_is_drawn_even_with_fewer_seeds(store: Store, add_run: Any) -> None:
@@ -49,12 +49,12 @@ def test_all_methods_are_drawn_from_one_profile(store: Store, add_run: Any) -> N
     small = [add_run(0, method="gail"), lone]
     full = [add_run(seed, spec=spec) for spec in quick.values() for seed in (0, 1)]
     assert chosen(store) == {"ssail": full[:2], "gail": full[2:]}
-    notes = selection.select(store, "fig4").notes
+    notes = series.select(store, "fig4").notes
     assert notes[-1] == (
         "wail is missing; run `ssmail train --method wail --env yjunction --profile quick --seeds 0-4`."
     )
     assert "1 other stored spec left out" in notes[1]
-    asked = selection.select(store, "fig4", profile="smoke")
+    asked = series.select(store, "fig4", profile="smoke")
     assert [run.id for run in asked.runs] == small
 
 
@@ -62,19 +62,19 @@ def test_runs_of_a_forgotten_profile_or_method_can_be_drawn(store: Store, add_ru
     old = build_spec("ssail", "yjunction", "smoke").model_copy(update={"profile": "forgotten"})
     run = add_run(0, spec=old)
     assert chosen(store) == {"ssail": [run]}
-    assert "; not the spec that experiments.yaml gives now" in selection.select(store, "fig4").notes[0]
+    assert "; not the spec that experiments.yaml gives now" in series.select(store, "fig4").notes[0]
     assert add_run(0) in chosen(store)["ssail"]  # the newest profile on a tie
 
 
 def test_what_is_left_out_is_said(store: Store, add_run: Any) -> None:
     add_run(0)
     add_run(1, state=RunState.FAILED)
-    note = selection.select(store, "fig4").notes[0]
+    note = series.select(store, "fig4").notes[0]
     spec_hash = store.runs()[0].spec_hash[:8]
     assert note == f"ssail: spec {spec_hash} (profile smoke), seeds 0; 1 unfinished run left out."
     add_run(0, overrides=OTHER)
     add_run(0, overrides=ANOTHER)
-    note = selection.select(store, "fig4").notes[0]
+    note = series.select(store, "fig4").notes[0]
     assert "2 other stored specs left out (choose with --runs)" in note
 
 
@@ -102,7 +102,7 @@ def test_runs_on_different_data_are_not_compared(store: Store, add_run: Any) -> 
 
 def test_a_run_of_another_environment_is_refused(store: Store, add_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run = add_run(0)
-    monkeypatch.setattr(selection, "figure_requirements", lambda name: FigureRequirements("mocap", ("ssail",)))
+    monkeypatch.setattr(series, "figure_requirements", lambda name: FigureRequirements("mocap", ("ssail",)))
     with pytest.raises(InputError, match=f"^run {run[:8]} is of yjunction, but fig4 draws mocap"):
         chosen(store, [run])
 
@@ -116,7 +116,7 @@ def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) ->
     )
     assert empty.value.exit_code == 2
     add_run(0, state=RunState.INTERRUPTED)
-    with pytest.raises(NoRuns, match="holds only unfinished runs of ssail") as unfinished:
+    with pytest.raises(NoRuns, match="holds no finished run of ssail") as unfinished:
         chosen(store)
     assert str(unfinished.value).endswith(command)
     add_run(0)
@@ -125,16 +125,16 @@ def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) ->
 
 def test_a_missing_method_is_said_and_the_others_are_drawn(store: Store, add_run: Any) -> None:
     ssail = add_run(0)
-    notes = selection.select(store, "fig5").notes
+    notes = series.select(store, "fig5").notes
     assert notes[-1] == (
         "dnri is missing; run `ssmail train --method dnri --env yjunction --profile smoke --seeds 0-4`."
     )
     dnri = add_run(0, method="dnri")
-    groups = selection.select(store, "fig5").groups
+    groups = series.select(store, "fig5").groups
     assert {group.label: [run.id for run in group.runs] for group in groups} == {"ssail": [ssail], "dnri": [dnri]}
 
 
 def test_no_run_of_the_profile_asked_for(store: Store, add_run: Any) -> None:
     add_run(0)
     with pytest.raises(NoRuns, match=r"holds no run of ssail on yjunction of profile paper; run .* --profile paper "):
-        selection.select(store, "fig4", profile="paper")
+        series.select(store, "fig4", profile="paper")

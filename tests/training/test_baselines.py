@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
-from ssmail.training.references import ConstantVelocity, CopyLast, NothingToLearn
+from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
 
 SCALING = Scaling(-20.0, 45.0, -0.7, 1.1)
 INTEGRATOR = Integrator(SCALING)
@@ -72,8 +72,7 @@ def test_one_step_by_hand() -> None:
 
 
 def test_there_is_nothing_to_learn_or_save() -> None:
-    learner = NothingToLearn(CopyLast())
-    learner.load_state_dict(learner.state_dict())
-    assert (learner.networks(), learner.state_dict(), learner.predictor.state_dict()) == ([], {}, {})
+    learner = BaselineLearner(CopyLast())
+    assert (learner.networks(), learner.parts(), learner.predictor.model.state_dict()) == ([], {}, {})
     with pytest.raises(NotImplementedError, match="nothing to learn"):
         learner.run_epoch(0)
