@@ -11,7 +11,7 @@ import typer
 
 from ssmail.errors import InputError
 from ssmail_cli import training_options as options
-from ssmail_cli.display import note
+from ssmail_cli.output import note
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
 from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ssmail_cli.display import complaint, note
+from ssmail_cli.output import complaint, note
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic

@@ -9,8 +9,8 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import SsmailError
-from ssmail_cli import ablate, claims, data, db, explain, mocap, plot, report, reproduce, runs, train
-from ssmail_cli.display import complaint
+from ssmail_cli import ablate, claims, datasets, db, explain, mocap, plot, report, reproduce, runs, train
+from ssmail_cli.output import complaint
 
 INTERRUPTED = 130
 
@@ -22,8 +22,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("generate-yjunction")(data.generate_yjunction)
-app.command("generate-letters")(data.generate_letters)
+app.command("generate-yjunction")(datasets.generate_yjunction)
+app.command("generate-letters")(datasets.generate_letters)
 app.command("prep-mocap")(mocap.prep_mocap)
 app.command("train")(train.train)
 app.command("ablate")(ablate.ablate)

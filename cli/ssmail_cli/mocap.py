@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail.errors import InputError
-from ssmail_cli.display import note, write_json
+from ssmail_cli.output import note, write_json
 from ssmail_cli.options import Json
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail.errors import InputError, SsmailError, unknown_name
-from ssmail_cli.display import Format
+from ssmail_cli.output import Format
 
 if TYPE_CHECKING:
     from ssmail.store import RunRow, Store

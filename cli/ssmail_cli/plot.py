@@ -9,11 +9,11 @@ from typer.core import TyperGroup
 
 from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
-from ssmail_cli.display import note
+from ssmail_cli.output import note
 from ssmail_cli.drawing import INCOMPLETE, draw_all
 from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Environment, Profile, open_store
-from ssmail_cli.results import SHOWN, shown_on
+from ssmail_cli.run_table import SHOWN, shown_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,8 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ssmail_cli.display import note, short
-from ssmail_cli.results import SHOWN, shown_on
+from ssmail_cli.output import note, short
+from ssmail_cli.run_table import SHOWN, shown_on
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -10,7 +10,7 @@ from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import training_options as options
-from ssmail_cli.display import chosen_format, complaint, note, print_rows
+from ssmail_cli.output import chosen_format, complaint, note, print_rows
 from ssmail_cli.drawing import draw_or_tell, undrawn
 from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from ssmail.errors import InputError
-from ssmail_cli.display import note
+from ssmail_cli.output import note
 from ssmail_cli.mocap import prep_mocap
 from ssmail_cli.progress import Sweep
 

@@ -10,8 +10,8 @@ import typer
 from ssmail.errors import InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
-from ssmail_cli.results import rows_with_metrics, run_row, shown_on
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
+from ssmail_cli.run_table import rows_with_metrics, run_row, shown_on
 
 if TYPE_CHECKING:
     from ssmail.store import RunRow, Store

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ssmail.errors import InputError
-from ssmail_cli.display import chosen_format, note, print_rows
+from ssmail_cli.output import chosen_format, note, print_rows
 from ssmail_cli.options import is_missing
 from ssmail_cli.progress import Sweep, label, reporter
-from ssmail_cli.results import key_metrics, rows_with_metrics
+from ssmail_cli.run_table import key_metrics, rows_with_metrics
 from ssmail_cli.training_options import ResumeChoice
 
 if TYPE_CHECKING:

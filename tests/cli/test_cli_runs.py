@@ -13,7 +13,7 @@ import pytest
 
 from ssmail.config.experiments import build_spec
 from ssmail.store import RunState, Store
-from ssmail_cli.results import SHOWN
+from ssmail_cli.run_table import SHOWN
 from tests.cli.command_line import CommandLine
 
 ERRORS = {0: 0.004, 1: 0.006, 2: 0.011}

@@ -8,7 +8,7 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.spec import ENVIRONMENTS
 from ssmail.training.loop import TrainingLoop
 from ssmail_cli.progress import LABELS
-from ssmail_cli.results import SHOWN, key_metrics, shown_on
+from ssmail_cli.run_table import SHOWN, key_metrics, shown_on
 from tests.data.mocap.handmade import write_set
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail_cli.display import write_json
+from ssmail_cli.output import write_json
 from ssmail_cli.options import Json
 
 if TYPE_CHECKING:
