@@ -1,4 +1,4 @@
-"""`ssmail generate-yjunction` and `ssmail generate-letters`: expert sets as files."""
+"""`ssmail generate-yjunction`, `generate-letters` and `prep-mocap`: expert sets as files."""
 
 import json
 from collections.abc import Mapping
@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail_cli.output import write_json
+from ssmail.errors import InputError
 from ssmail_cli.options import Json
+from ssmail_cli.output import note, write_json
 
 if TYPE_CHECKING:
     from ssmail.config.sections import DataSpec
+    from ssmail.data.trajectories import ExpertSet
 
 IN_FILE = "as in experiments.yaml"
+DEFAULT_CACHE = "data/cmu"
 
 Train = Annotated[int | None, typer.Option("--train", help="Training trajectories.", show_default=IN_FILE)]
 Validation = Annotated[int | None, typer.Option("--validation", help="Validation trajectories.", show_default=IN_FILE)]
@@ -96,6 +99,58 @@ def generate_letters(
     _write(_data("letters", given), out, force, as_json)
 
 
+def prep_mocap(
+    source: Annotated[
+        Path | None,
+        typer.Option("--source", help="Folder or zip file that holds, at any depth, 35.asf and 35_01.amc ..."),
+    ] = None,
+    download: Annotated[
+        bool, typer.Option("--download", help="Fetch the files from the CMU site instead, slowly, into --cache.")
+    ] = False,
+    cache: Annotated[
+        Path | None,
+        typer.Option("--cache", help="With --download: where its files are kept.", show_default=DEFAULT_CACHE),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/mocap.npz"),
+    subject: Annotated[int, typer.Option("--subject", min=1, max=999, help="Number of the subject.")] = 35,
+    train: Annotated[str, typer.Option("--train", help="Trials to train on, as 01-12 or 1-3,7.")] = "01-12",
+    validation: Annotated[str, typer.Option("--validation", "--val", help="Trials to validate on.")] = "13-16",
+    test: Annotated[str, typer.Option("--test", help="Trials to test on.")] = "28-34",
+    allow_missing: Annotated[
+        bool, typer.Option("--allow-missing", help="Go on without the trials that are not there.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Prepare the Noisy Mocap expert set from files of the CMU motion capture database.
+
+    The trials are cut into windows of 50 frames, and of 100 for testing. The .npz holds positions and velocities of
+    all joints in the files' own units, the skeleton, and where each window is from. Train on it with --env mocap.
+    """
+    from ssmail.data import expert_file
+    from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
+
+    wanted = MocapParameters(
+        subject=subject,
+        train=parse_trials(train, "--train"),
+        validation=parse_trials(validation, "--validation"),
+        test=parse_trials(test, "--test"),
+    )
+    if cache is not None and not download:
+        raise InputError("--cache belongs to --download; leave --cache out, or let --download fetch the files into it")
+    if (source is None) == (not download):
+        raise InputError("give either --source with a folder or zip file of the CMU files, or --download")
+    expert_file.check_target(out, force=force)
+    if source is None:
+        from ssmail.data.mocap.download import fetch
+
+        trials = (*wanted.train, *wanted.validation, *wanted.test)
+        source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing)
+    experts = prepare(source, wanted, allow_missing=allow_missing)
+    expert_file.save(experts, out, force=force)
+    _print_set(experts, out, as_json)
+
+
 def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
     """The data section of experiments.yaml with the options that were given. Raises InputError for a bad one."""
     from ssmail.config.experiments import build_spec
@@ -116,3 +171,38 @@ def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
         return
     sizes = f"{len(experts.train)}/{len(experts.validation)}/{len(experts.test)}"
     typer.echo(f"wrote {out}: {sizes} training/validation/test trajectories, hash {experts.hash[:16]}")
+
+
+def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
+    """Print what was written, and on stderr the trials that are missing."""
+    splits = {"train": experts.train, "validation": experts.validation, "test": experts.test}
+    windows = {name: len(split) for name, split in splits.items()}
+    scaling = experts.scaling
+    positions = scaling.position_min, scaling.position_max
+    velocities = scaling.velocity_min, scaling.velocity_max
+    missing = experts.parameters["missing"]
+    assert isinstance(missing, list)
+    if as_json:
+        write_json(
+            {
+                "path": out,
+                "hash": experts.hash,
+                "windows": windows,
+                "scaling": {"positions": positions, "velocities": velocities},
+                "joints": experts.joints,
+                "missing": missing,
+                "parameters": experts.parameters,
+                "sources": experts.sources,
+            },
+            None,
+        )
+    else:
+        typer.echo(
+            f"wrote {out}: {'/'.join(map(str, windows.values()))} training/validation/test windows of "
+            f"{len(experts.joints)} joints, hash {experts.hash[:16]}"
+        )
+        for what, (low, high) in (("positions", positions), ("velocities", velocities)):
+            typer.echo(f"training {what} from {low:#.6g} to {high:#.6g}")
+    if missing:
+        trials = ", ".join(f"{trial:02d}" for trial in missing)
+        note(f"trials that were asked for but are not there, so not in the set: {trials}")
