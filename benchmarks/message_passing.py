@@ -1,4 +1,4 @@
-"""dnri's training step with per-node first layers, as in ssmail, beside the plain edge-gather form (edge_gather.py).
+"""dnri's training step in the fast form of its message passing beside the readable one (message_passing.FAST).
 
 Both forms use the same weights and take turns. CPU seconds, so that other programs disturb them less.
 """
@@ -8,14 +8,13 @@ import time
 from collections.abc import Callable
 
 import torch
-from edge_gather import GatherDynamicEncoder, GatherEmbedding, GatherMessageDecoder, GatherRecurrentDecoder
 from torch import nn
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import VariationalSpec, required
 from ssmail.losses.likelihood import variational_loss
-from ssmail.models.decoders import MessageDecoder, make_decoder
-from ssmail.models.edge_perceptron import ScaledEdges
+from ssmail.models import message_passing
+from ssmail.models.decoders import make_decoder
 from ssmail.models.graph_encoder import GraphNoise, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder
 
@@ -54,47 +53,45 @@ def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, sp
 
     def work() -> torch.Tensor:
         edges = embed(states)
-        return (edges.tensor() if isinstance(edges, ScaledEdges) else edges).sum() + decoder(states, graph)[0].sum()
+        return edges.tensor().sum() + decoder(states, graph)[0].sum()
 
     return work
 
 
-def forms_of(name: str) -> dict[str, tuple[Work, Work]]:
-    """What is timed -> ssmail's form and the plain one, with the same weights."""
+def works_of(name: str) -> dict[str, Work]:
+    """What is timed, by name."""
     (b, t, n, p), hidden, memory, decoder_name = CASES[name]
     spec = required(build_spec("dnri", "yjunction", "quick").variational).model_copy(
         update={"hidden": hidden, "memory": memory, "decoder": decoder_name, "decoder_hidden": hidden}
     )
     torch.manual_seed(0)
     states, encoder, decoder = torch.randn(b, t, n, 2 * p), DynamicEncoder(2 * p, spec), make_decoder(2 * p, p, spec)
-    plain_encoder, plain_embedding = GatherDynamicEncoder(encoder), GatherEmbedding(encoder.embedding)
-    plain = GatherMessageDecoder(decoder) if isinstance(decoder, MessageDecoder) else GatherRecurrentDecoder(decoder)
     return {
-        "step": tuple(whole_step(e, d, states, spec) for e, d in ((encoder, decoder), (plain_encoder, plain))),
-        "messages": tuple(
-            messages_only(e, d, states, spec) for e, d in ((encoder.embedding, decoder), (plain_embedding, plain))
-        ),
+        "step": whole_step(encoder, decoder, states, spec),
+        "messages": messages_only(encoder.embedding, decoder, states, spec),
     }
 
 
-def median_seconds(forms: tuple[Work, Work]) -> list[float]:
-    """Median CPU seconds of each form, forward and backward (the optimiser is left out), without a warm-up round."""
-    taken: list[list[float]] = [[] for _ in forms]
+def median_seconds(work: Work) -> list[float]:
+    """Median CPU seconds of the fast and the readable form, forward and backward (the optimiser is left out), without a
+    warm-up round.
+    """
+    taken: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS + 1):
-        for times, form in zip(taken, forms, strict=True):
+        for times, message_passing.FAST in zip(taken, (True, False), strict=True):
             begin = time.process_time()
-            form().backward()
+            work().backward()
             times.append(time.process_time() - begin)
     return [statistics.median(times[1:]) for times in taken]
 
 
 def compare() -> None:
     """Print two lines for each case: the whole training step, and its message passing alone."""
-    print(f"\n{'dnri, CPU seconds':<34}{'per node':>10}{'edge gather':>14}{'ratio':>8}")
+    print(f"\n{'dnri, CPU seconds':<34}{'fast':>10}{'readable':>14}{'ratio':>8}")
     for name in CASES:
-        for what, forms in forms_of(name).items():
-            ours, plain = median_seconds(forms)
-            print(f"{name + ', ' + what:<34}{ours:10.4f}{plain:14.4f}{plain / ours:8.2f}", flush=True)
+        for what, work in works_of(name).items():
+            fast, readable = median_seconds(work)
+            print(f"{name + ', ' + what:<34}{fast:10.4f}{readable:14.4f}{readable / fast:8.2f}", flush=True)
 
 
 if __name__ == "__main__":

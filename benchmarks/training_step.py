@@ -1,7 +1,7 @@
-"""CPU seconds and peak memory of a training step of dnri and nri, in ssmail's form and in the plain one.
+"""CPU seconds and peak memory of a training step of dnri and nri, in the fast form and in the readable one.
 
-A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The plain form replaces the
-networks' forward passes by those of edge_gather.py; weights, inputs and random numbers are the same. Each measurement
+A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The forms differ by
+`ssmail.models.message_passing.FAST` only; weights, inputs and random numbers are the same. Each measurement
 is a fresh process with one thread, so that its peak memory is its own; the forms take turns. The first step of each
 process warms it up and is not counted; the difference of its results between the forms is told. Whether the forms are
 equal is decided in double precision, at the same widths on windows of SHORT states: single precision is no judge, for
@@ -22,21 +22,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-try:  # as a script, and from the tests
-    from edge_gather import make_plain
-except ModuleNotFoundError:
-    from benchmarks.edge_gather import make_plain
-
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
-from ssmail.training.learning import Setting
-from ssmail.training.replay import Batch
+from ssmail.models import message_passing
+from ssmail.training.batches import Batch
+from ssmail.training.learner import LearnerContext
 from ssmail.training.seeding import Generators
 from ssmail.training.variational import VariationalLearner
 
-FORMS = ("plain", "ours")
+FORMS = ("readable", "fast")
 BATCH = {"dnri": 4, "nri": 8}
 SIZES = {  # agents, states in a window, and hidden, memory, head, decoder_hidden of `variational`
     "authors": (31, 50, (256, 64, 128, 256)),
@@ -74,16 +70,24 @@ def make_learner(
     scaling = Scaling(position_min=-1.0, position_max=1.0, velocity_min=-1.0 / 3, velocity_max=1.0 / 3)
     experts = walkers(agents, steps)
     experts = Batch(experts.states.to(dtype), experts.actions.to(dtype), experts.source)
-    learner = VariationalLearner(Setting(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
+    learner = VariationalLearner(LearnerContext(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
     learner.model.to(dtype)
-    if form == "plain":
-        make_plain(learner.model.encoder, learner.model.decoder)
+    update = learner._update
+
+    def in_form(*forcing: Tensor) -> dict[str, float]:
+        message_passing.FAST = form == "fast"
+        try:
+            return update(*forcing)
+        finally:
+            message_passing.FAST = True
+
+    learner._update = in_form
     return learner
 
 
 def one_step(learner: VariationalLearner) -> dict[str, float]:
     """A training step under complete teacher forcing; the metrics of the loss."""
-    return learner._update(torch.ones(learner.training.batch, learner.setting.steps, dtype=torch.bool))
+    return learner._update(torch.ones(learner.training.batch, learner.context.steps, dtype=torch.bool))
 
 
 def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
@@ -104,13 +108,13 @@ def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
     return {name: torch.tensor(value, dtype=torch.float64) for name, value in metrics.items()} | seen | gradients
 
 
-def largest_difference(plain: dict[str, Tensor], ours: dict[str, Tensor]) -> tuple[float, float]:
+def largest_difference(readable: dict[str, Tensor], fast: dict[str, Tensor]) -> tuple[float, float]:
     """The largest absolute difference of any result but gradients, and the largest difference of any result relative
     to the largest value of that result.
     """
     absolute = relative = 0.0
-    for name, value in plain.items():
-        difference = float((value - ours[name]).abs().max())
+    for name, value in readable.items():
+        difference = float((value - fast[name]).abs().max())
         relative = max(relative, difference / max(float(value.abs().max()), 1e-12))
         if name.startswith(("encoder", "decoder")):
             absolute = max(absolute, difference)
@@ -151,12 +155,12 @@ def compare_steps(method: str, size: str, rounds: int, steps: int) -> None:
             measured = json.loads(done.stdout)
             seconds[form] += measured["seconds"]
             peak[form] = max(peak[form], measured["peak"])
-        plain, ours = (torch.load(Path(folder) / form) for form in FORMS)
+        readable, fast = (torch.load(Path(folder) / form) for form in FORMS)
     median = {form: statistics.median(taken) for form, taken in seconds.items()}
     for form in FORMS:
-        ratio = f"{median['plain'] / median[form]:8.2f}{peak['plain'] / peak[form]:8.2f}"
+        ratio = f"{median['readable'] / median[form]:8.2f}{peak['readable'] / peak[form]:8.2f}"
         print(f"{method + ', ' + size + ', ' + form:<34}{median[form]:10.3f}{peak[form]:10.0f}{ratio}", flush=True)
-    absolute, relative = largest_difference(plain, ours)
+    absolute, relative = largest_difference(readable, fast)
     print(f"  in single precision: outputs to {absolute:.1e}, gradients to {relative:.1e} of the largest value")
     check_equal(method, size)
 

@@ -80,10 +80,10 @@ def test_no_import_goes_upward(source_root: Path) -> None:
 def test_a_planted_upward_import_is_caught(tmp_path: Path, statement: str) -> None:
     planted = tmp_path / "ssmail" / "training" / "loop.py"
     planted.parent.mkdir(parents=True)
-    planted.write_text(f"import torch\nfrom ssmail.models import actor\n{statement}\n")
+    planted.write_text(f"import torch\nfrom ssmail.models import policy\n{statement}\n")
     (found,) = violations(tmp_path)
     assert found.startswith("ssmail/training/loop.py:")
-    planted.write_text("import torch\nfrom ssmail.models import actor\nfrom ..evaluation import metrics\n")
+    planted.write_text("import torch\nfrom ssmail.models import policy\nfrom ..evaluation import metrics\n")
     assert violations(tmp_path) == []
 
 

@@ -127,7 +127,7 @@ def prep_mocap(
     The trials are cut into windows of 50 frames, and of 100 for testing. The .npz holds positions and velocities of
     all joints in the files' own units, the skeleton, and where each window is from. Train on it with --env mocap.
     """
-    from ssmail.data import expert_file
+    from ssmail.data import expert_sets
     from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
 
     wanted = MocapParameters(
@@ -140,14 +140,14 @@ def prep_mocap(
         raise InputError("--cache belongs to --download; leave --cache out, or let --download fetch the files into it")
     if (source is None) == (not download):
         raise InputError("give either --source with a folder or zip file of the CMU files, or --download")
-    expert_file.check_target(out, force=force)
+    expert_sets.check_target(out, force=force)
     if source is None:
         from ssmail.data.mocap.download import fetch
 
         trials = (*wanted.train, *wanted.validation, *wanted.test)
         source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing)
     experts = prepare(source, wanted, allow_missing=allow_missing)
-    expert_file.save(experts, out, force=force)
+    expert_sets.save(experts, out, force=force)
     _print_set(experts, out, as_json)
 
 
@@ -161,11 +161,10 @@ def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
 
 
 def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
-    from ssmail.data import expert_file
-    from ssmail.data.generators import generate
+    from ssmail.data import expert_sets
 
-    experts = generate(data)
-    expert_file.save(experts, out, force=force)
+    experts = expert_sets.generate(data)
+    expert_sets.save(experts, out, force=force)
     if as_json:
         write_json({"path": out, "hash": experts.hash, "parameters": experts.parameters}, None)
         return

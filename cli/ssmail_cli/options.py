@@ -143,16 +143,17 @@ def select_runs(
     state: str | None,
     figure: str | None,
 ) -> "list[RunRow]":
-    """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
+    """Return the runs that meet every condition, newest last. Raises InputError for an unknown id, state or figure."""
+    from ssmail.plots.series import needed_by
     from ssmail.store import RunState
 
     if state is not None and state not in list(RunState):
         raise unknown_name("state", state, list(RunState))
-    if figure in FIGURES:
-        figure = FIGURES[figure].name  # experiments.yaml knows no aliases
-    return store.runs(
-        ids=ids or None, method=method, environment=environment, profile=profile, state=state, figure=figure
-    )
+    runs = store.runs(ids=ids or None, method=method, environment=environment, profile=profile, state=state)
+    if figure is None:
+        return runs
+    needed = needed_by(FIGURES[figure].name if figure in FIGURES else figure)  # experiments.yaml knows no aliases
+    return [run for run in runs if needed(run)]
 
 
 def parse_seeds(text: str) -> list[int]:

@@ -99,7 +99,6 @@ def reproduce(
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
     """Return the cells of each figure asked for, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
-    from ssmail.execution.figure_cells import figure_cells
 
     listed = load_experiments().figures
     choices = {key: figure.name for key, figure in FIGURES.items() if figure.name in listed}
@@ -108,6 +107,18 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
         if name not in choices:
             raise unknown_name("figure", name, choices)
     return {name: figure_cells(name, profile, seeds) for name in dict.fromkeys(choices[name] for name in wanted)}
+
+
+def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
+    """Return the cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
+    from ssmail.execution.local import Cell
+    from ssmail.plots.series import figure_specs
+
+    return {
+        Cell(spec, seed): {**names, "seed": seed}
+        for spec, names in figure_specs(figure, profile).items()
+        for seed in seeds
+    }
 
 
 def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
@@ -179,7 +190,7 @@ def _train(
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, the longest first. Raises typer.Exit when interrupted."""
     from ssmail.execution.cells import check_labels
-    from ssmail.execution.figure_cells import longest_first
+    from ssmail.execution.durations import longest_first
     from ssmail.store import Store
 
     needed = _trainable(figures, data)
@@ -220,7 +231,7 @@ def _stored_runs(store: "Store", sweep: Sweep) -> "dict[Cell, str]":
 
 def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
     """Estimate from the stored runs how long a run of each spec takes."""
-    from ssmail.execution.figure_cells import estimated_seconds
+    from ssmail.execution.durations import estimated_seconds
     from ssmail.store import Store
 
     runs = [] if is_missing(db) else Store.open(db).runs(state="finished")
@@ -255,7 +266,7 @@ def _stored_cells(sweep: Sweep, data: _Data, db: str) -> "set[Cell]":
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     """Estimate the time of runs that take these seconds (None: unknown), `jobs` at once; as a number and in words."""
-    from ssmail.execution.figure_cells import total_seconds
+    from ssmail.execution.durations import total_seconds
 
     known = [value for value in each if value is not None]
     total = total_seconds(known, jobs)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.data import expert_file, letters, yjunction
+from ssmail.data import expert_sets, letters, yjunction
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance
@@ -33,7 +33,7 @@ def test_the_default_set_is_that_of_experiments_yaml(cli: CommandLine, tmp_path:
     outcome = cli("generate-yjunction", "--out", out)
     assert outcome.code == 0
     params = build_spec("ssail", "yjunction", "quick").data.yjunction
-    experts = expert_file.load(out)
+    experts = expert_sets.load(out)
     assert experts.hash == yjunction.generate(params).hash
     assert experts.hash[:16] in outcome.out
     assert f"{params.train}/{params.validation}/{params.test}" in outcome.out
@@ -54,7 +54,7 @@ def test_every_option_reaches_the_generator(cli: CommandLine, tmp_path: Path) ->
     outcome = cli("generate-yjunction", "--out", tmp_path / "set.npz", "--json", *options)
     told = json.loads(outcome.out)
     assert told["parameters"] == wanted
-    assert told["hash"] == expert_file.load(tmp_path / "set.npz").hash
+    assert told["hash"] == expert_sets.load(tmp_path / "set.npz").hash
 
 
 def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLine, tmp_path: Path) -> None:
@@ -62,12 +62,12 @@ def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLin
     assert cli("generate-letters", "--out", out).code == 0
     params = build_spec("ssail", "letters", "quick").data.letters
     assert params is not None
-    assert expert_file.load(out, "letters").hash == letters.generate(params).hash
+    assert expert_sets.load(out, "letters").hash == letters.generate(params).hash
     wanted = {"word": "NO", "train": 3, "validation": 4, "test": 5, "steps": 40, "jitter": 0.5, "seed": 7}
     options = [part for key, value in wanted.items() for part in (f"--{key}", value)]
     told = json.loads(cli("generate-letters", "--out", out, "--force", "--json", *options).out)
     assert told["parameters"] == {"environment": "letters", **wanted}  # NO is a word, though YAML reads "no" in it
-    read = expert_file.load(out, "letters")
+    read = expert_sets.load(out, "letters")
     assert told["hash"] == read.hash
     made = letters.generate(params.model_copy(update=wanted))
     assert made.hash == read.hash
@@ -90,7 +90,7 @@ def test_a_file_is_overwritten_only_with_force(cli: CommandLine, tmp_path: Path)
     assert cli(*small, "--seed", 1).sentence.startswith(f"{out} exists already")
     assert out.read_bytes() == before
     assert cli(*small, "--seed", 1, "--force").code == 0
-    assert expert_file.load(out).parameters["seed"] == 1
+    assert expert_sets.load(out).parameters["seed"] == 1
 
 
 @pytest.mark.parametrize(
@@ -226,7 +226,7 @@ def test_nothing_is_drawn_before_all_options_are_parsed(cli: CommandLine, db: Pa
             "fig8 --env yjunction --profile quick",
             "run `ssmail ablate alpha --env yjunction --profile quick --seeds 0-4`.",
         ),
-        ("fig8", "no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
+        ("fig8", "no run of the ablation alpha on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`."),
         ("fig9 --stat mean-ci", "`ssmail plot fig9` has no option --stat;"),
         ("fig4 --stat mean", "unknown statistic 'mean'; did you mean mean-ci?"),
         ("fig10", "unknown figure 'fig10'; did you mean fig"),

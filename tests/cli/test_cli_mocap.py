@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ssmail.data import expert_file
+from ssmail.data import expert_sets
 from ssmail.data.mocap import download
 from ssmail.errors import InputError
 from tests.cli.command_line import CommandLine
@@ -27,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_set_is_written_and_told_of(cli: CommandLine, folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "set.npz"
     outcome = cli("prep-mocap", "--source", folder, "--out", out, *SMALL)
-    experts = expert_file.load(out, "mocap")
+    experts = expert_sets.load(out, "mocap")
     assert (outcome.code, outcome.err) == (0, "")
     first, positions, velocities = outcome.out.splitlines()
     wrote = f"wrote {out}: 5/1/1 training/validation/test windows of 5 joints, hash {experts.hash[:16]}"
@@ -41,7 +41,7 @@ def test_json_for_programs(cli: CommandLine, folder: Path, tmp_path: Path) -> No
     (folder / "35_02.amc").unlink()
     out = tmp_path / "set.npz"
     outcome = cli("prep-mocap", "--source", folder, "--out", out, *SMALL, "--allow-missing", "--json")
-    told, experts = json.loads(outcome.out), expert_file.load(out)
+    told, experts = json.loads(outcome.out), expert_sets.load(out)
     assert told["path"] == str(out)
     assert told["hash"] == experts.hash
     assert told["windows"] == {"train": 2, "validation": 1, "test": 1}
@@ -60,7 +60,7 @@ def test_another_subject_in_a_zip_file(cli: CommandLine, tmp_path: Path) -> None
             archive.write(file, f"subjects/07/{file.name}")
     options = ("--train", "1", "--validation", "2", "--test", "3", "--out", tmp_path / "set.npz")
     assert cli("prep-mocap", "--subject", 7, "--source", tmp_path / "cmu.zip", *options).code == 0
-    assert expert_file.load(tmp_path / "set.npz").parameters["subject"] == 7
+    assert expert_sets.load(tmp_path / "set.npz").parameters["subject"] == 7
 
 
 def test_a_file_is_overwritten_only_with_force(cli: CommandLine, folder: Path, tmp_path: Path) -> None:
@@ -136,22 +136,23 @@ def test_downloaded_files_are_a_source(
     with misbehaving_site.serving() as site:
         monkeypatch.setattr(download, "BASE_URL", site.url)
         site.files = {f"/subjects/35/{file.name}": file.read_bytes() for file in folder.iterdir()}
+        monkeypatch.setattr(download, "SHA256", misbehaving_site.digests(site))
         outcome = cli(*options)
         assert (outcome.code, len(site.asked)) == (0, 5)
         assert "may not be resold" in outcome.err
-        assert expert_file.load(out).hash == prepared_hash(cli, folder, tmp_path)
+        assert expert_sets.load(out).hash == prepared_hash(cli, folder, tmp_path)
         assert cli(*options).sentence.endswith("overwrite it with --force")
         assert len(site.asked) == 5, "the site is asked only when the set may be written"
         del site.files["/subjects/35/35_02.amc"]
         elsewhere = (*options, "--cache", tmp_path / "empty", "--force")
         assert "35_02.amc (the server answered 404)" in cli(*elsewhere).err
         assert cli(*elsewhere, "--allow-missing").code == 0
-        assert expert_file.load(out).parameters["missing"] == [2]
+        assert expert_sets.load(out).parameters["missing"] == [2]
 
 
 def prepared_hash(cli: CommandLine, folder: Path, tmp_path: Path) -> str:
     cli("prep-mocap", "--source", folder, "--out", tmp_path / "given.npz", *SMALL)
-    return expert_file.load(tmp_path / "given.npz").hash
+    return expert_sets.load(tmp_path / "given.npz").hash
 
 
 def test_a_download_that_fails(cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

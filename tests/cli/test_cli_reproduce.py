@@ -7,18 +7,18 @@ from typing import Any
 
 import pytest
 
-from ssmail.execution.figure_cells import figure_cells
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.plots import provenance
 from ssmail.store import Store
+from ssmail_cli.reproduce import figure_cells
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
 from tests.data.mocap.handmade import write_subject
 from tests.paper.handmade_arrays import forecasts
 
 SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
 LEFT_OUT = (
-    "is left out: there is no data/mocap.npz; `ssmail prep-mocap --source DIR --out data/mocap.npz` makes it from files "
-    "of the CMU database, and --download fetches those (or give --cmu-dir DIR)."
+    "is left out: there is no data/mocap.npz; `ssmail prep-mocap --source DIR --out data/mocap.npz` makes it from "
+    "files of the CMU database, and --download fetches those (or give --cmu-dir DIR)."
 )
 
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.data import expert_file
+from ssmail.data import expert_sets
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.plots import skeleton
 from tests.cli.command_line import CommandLine
@@ -16,7 +16,7 @@ def data(tmp_path: Path) -> Path:
     source = write_subject(tmp_path / "source", {1: 60, 2: 60, 3: 120})
     path = tmp_path / "mocap.npz"
     wanted = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,))
-    expert_file.save(prepare(source, wanted), path)
+    expert_sets.save(prepare(source, wanted), path)
     return path
 
 

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import MOST_LETTERS, LettersSpec
-from ssmail.data import letters, pen
+from ssmail.data import letters
 
 
 def params(**changes: object) -> LettersSpec:
@@ -31,15 +31,15 @@ def test_every_letter_has_a_stroke_in_the_unit_box() -> None:
         assert box.max() <= 1, letter
         assert np.ptp(box[:, 1]) > 0.98, letter  # as high as the line
         assert (np.linalg.norm(np.diff(stroke, axis=0), axis=1) > 0).all(), letter
-        assert not ((np.rad2deg(pen.turns(stroke)) > 30) & (np.rad2deg(pen.turns(stroke)) < 38)).any(), letter
+        assert not ((np.rad2deg(letters.turns(stroke)) > 30) & (np.rad2deg(letters.turns(stroke)) < 38)).any(), letter
 
 
 def test_arc_lengths_of_letters_by_hand() -> None:
     """M: two stems of 1 and two diagonals over half the width and 0.7 of the height. L: foot and stem."""
-    m, ell = (pen.arc_lengths(letters.strokes()[letter])[-1] for letter in "ML")
+    m, ell = (letters.arc_lengths(letters.strokes()[letter])[-1] for letter in "ML")
     assert m == pytest.approx(2 + 2 * np.hypot(letters.WIDTH / 2, 0.7))
     assert ell == pytest.approx(letters.WIDTH + 1)
-    round_o = pen.arc_lengths(letters.strokes()["O"])[-1]
+    round_o = letters.arc_lengths(letters.strokes()["O"])[-1]
     a, b = letters.WIDTH / 2, 0.5
     h = ((a - b) / (a + b)) ** 2
     assert round_o == pytest.approx(np.pi * (a + b) * (1 + 3 * h / (10 + np.sqrt(4 - 3 * h))), rel=0.01)  # Ramanujan
@@ -95,7 +95,7 @@ def test_a_letter_goes_from_its_first_to_its_last_point_past_every_corner(letter
     np.testing.assert_allclose(drawn[0], letters.START)
     np.testing.assert_allclose(drawn[-1], stroke[-1], atol=1e-9)
     np.testing.assert_allclose(line[-1], stroke[-1], atol=1e-6)
-    for corner in (part[0] for part in pen.parts_of(stroke)):
+    for corner in (part[0] for part in letters.parts_of(stroke)):
         assert np.linalg.norm(line - corner, axis=1).min() < 0.065
     gaps = np.linalg.norm(np.diff(line, axis=0), axis=1)
     assert gaps.max() < 1.05 * np.median(gaps)  # equal distances, but for the corners they cut

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from ssmail.config.sections import YJunctionSpec
 from ssmail.data.yjunction import generate
 from ssmail.evaluation import metrics
-from ssmail.evaluation.protocol import full_metrics, one_step_mse, quick_metrics
+from ssmail.evaluation.metrics import lane_metrics, lane_test_metrics, one_step_mse
 
 PARAMS = YJunctionSpec(train=30, validation=1, test=20, agents=3, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
 EXPERTS = generate(PARAMS)
@@ -14,7 +14,7 @@ TRUTH = EXPERTS.test
 
 
 def quick(predicted: np.ndarray) -> dict[str, float]:
-    return quick_metrics(predicted, TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
+    return lane_metrics(predicted, TRUTH.continuations, EXPERTS.centre_lines, EXPERTS.scaling)
 
 
 @pytest.mark.parametrize("lane", [0, 1])
@@ -59,7 +59,7 @@ def test_mode_mse_by_hand() -> None:
 def test_distance_goes_on_along_the_last_segment() -> None:
     line = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
     points = np.array([[0.5, 0.3], [1.0, 50.0], [3.0, 9.0], [-3.0, -4.0]])
-    np.testing.assert_allclose(metrics.distance_to_line(points, line), [0.3, 0, 2, 5])
+    np.testing.assert_allclose(metrics.polyline_distances(points, line, extended=True), [0.3, 0, 2, 5])
 
 
 @given(delay=st.integers(1, 4))
@@ -81,10 +81,10 @@ def test_diverged() -> None:
 
 def test_best_of_samples() -> None:
     """min_ade takes the best sample of each start: with one sample per lane it is 0, while ade counts both."""
-    values = full_metrics(TRUTH.continuations, TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
+    values = lane_test_metrics(TRUTH.continuations, TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
     assert values["min_ade_20"] == values["min_fde_20"] == 0
     assert values["ade"] > 1
-    one_lane = full_metrics(TRUTH.continuations[:1], TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
+    one_lane = lane_test_metrics(TRUTH.continuations[:1], TRUTH, EXPERTS.centre_lines, EXPERTS.scaling)
     assert one_lane["min_ade_20"] > 1
 
 

@@ -5,8 +5,15 @@ import pytest
 from scipy.special import ndtr
 from scipy.stats import binom, mannwhitneyu
 
-from ssmail.evaluation.order_statistics import ALPHA, rank_test, sign_test
-from ssmail.evaluation.power import POWER, seeds_for_every, seeds_for_rank_test, seeds_for_sign_test
+from ssmail.evaluation.hypothesis_tests import (
+    ALPHA,
+    POWER,
+    rank_test,
+    seeds_for_every,
+    seeds_for_rank_test,
+    seeds_for_sign_test,
+    sign_test,
+)
 
 
 def test_five_of_five_are_the_fewest() -> None:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from itertools import permutations, product
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -10,18 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from ssmail.evaluation.statistics import (
-    LARGEST,
-    PermutationTest,
-    Statistic,
-    mean_interval,
-    mean_std,
-    median_quartiles,
-    midranks,
-    paired_permutation_test,
-    permutation_test,
-    summarise,
-)
+from ssmail.evaluation.hypothesis_tests import MAX_SPLITS, PermutationTest, midranks, permutation_test
+from ssmail.evaluation.statistics import Statistic, mean_interval, mean_std, median_quartiles, summarise
 
 inf, nan = math.inf, math.nan
 FIVE = [2.0, 4.0, 4.0, 5.0, 10.0]
@@ -194,7 +184,7 @@ def test_diverged_runs_are_the_worst_rank_and_refused_among_values() -> None:
     assert permutation_test(healthy, broken, on="ranks") == permutation_test(healthy, finite, on="ranks")
     with pytest.raises(ValueError, match="test on ranks"):
         permutation_test(healthy, broken)
-    with pytest.raises(ValueError, match="one known number for each run"):
+    with pytest.raises(ValueError, match="one known number per run"):
         permutation_test(healthy, [1.0, nan], on="ranks")
 
 
@@ -226,62 +216,9 @@ def test_under_the_null_small_p_are_as_rare_as_they_say() -> None:
 
 def test_too_many_runs_are_refused_and_ten_are_not() -> None:
     assert permutation_test(np.arange(10), np.arange(10) + 10.5).p == 2 / math.comb(20, 10)
-    assert math.comb(22, 11) > LARGEST
+    assert math.comb(22, 11) > MAX_SPLITS
     with pytest.raises(ValueError, match="705432 splits are too many"):
         permutation_test(np.arange(11), np.arange(11))
-    with pytest.raises(ValueError, match="262144 splits are too many"):
-        paired_permutation_test(np.arange(18), np.arange(18))
-
-
-# -- pairs -------------------------------------------------------------------------------------------------------------
-
-
-def test_pairs_by_hand() -> None:
-    first, second = [2.0, 4.0, 6.0, 8.0, 10.0], [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert paired_permutation_test(first, second) == PermutationTest(3.0, 2 / 32, 2 / 32, 32)
-    assert paired_permutation_test(first, second, "greater").p == 1 / 32
-    assert paired_permutation_test(first, second, "less").p == 1
-    # differences 1, 1, -1: four of eight sign patterns sum to at least 1, and all have |sum| >= 1
-    found = paired_permutation_test([1.0, 1.0, 0.0], [0.0, 0.0, 1.0], "greater")
-    assert (found.difference, found.p, found.least) == pytest.approx((1 / 3, 4 / 8, 1 / 8))
-    assert permutation_test(first, second).p > 2 / 32  # unpaired, the seeds' own spread hides it
-
-
-@given(st.lists(st.tuples(whole, whole), min_size=1, max_size=6), st.sampled_from(ALTERNATIVES))
-@settings(max_examples=40)
-def test_pairs_are_the_brute_force_ones(pairs: list[tuple[float, float]], alternative: str) -> None:
-    first, second = zip(*pairs, strict=True)
-
-    def extremity(swaps: Sequence[bool]) -> float:
-        total = sum((b - a) if swap else (a - b) for (a, b), swap in zip(pairs, swaps, strict=True))
-        return {"two-sided": abs(total), "greater": total, "less": -total}[alternative]
-
-    cases = [extremity(swaps) >= extremity([False] * len(pairs)) for swaps in product([False, True], repeat=len(pairs))]
-    assert paired_permutation_test(first, second, alternative).p == pytest.approx(sum(cases) / len(cases))
-
-
-@pytest.mark.parametrize("alternative", ALTERNATIVES)
-def test_pairs_are_scipys(alternative: str) -> None:
-    generator = np.random.default_rng(4)
-    a, b = generator.normal(size=5), generator.normal(size=5)
-    options = {"permutation_type": "samples", "alternative": alternative, "vectorized": True}
-    expected = stats.permutation_test((a, b), lambda x, y, axis: (x - y).mean(axis=axis), **options)
-    assert paired_permutation_test(a, b, alternative).p == pytest.approx(expected.pvalue)
-    expected = stats.wilcoxon(a, b, alternative=alternative, method="exact")
-    assert paired_permutation_test(a, b, alternative, on="ranks").p == pytest.approx(expected.pvalue)
-
-
-def test_diverged_pairs() -> None:
-    first, second = [1.0, 2.0, inf, inf], [2.0, inf, inf, 3.0]  # better, better, both lost, worse
-    found = paired_permutation_test(first, second, on="ranks")  # ranks 2, 3.5, 1 and 3.5, signs -, -, 0, +
-    assert found.difference == pytest.approx(-2 / 4)
-    # sums of +-2 +-3.5 +-3.5 are +-9, +-5, +-2 (twice each): all are at least 2, each with both signs of the zero
-    assert found.p == 1
-    assert found.least == 4 / 16
-    with pytest.raises(ValueError, match="test on ranks"):
-        paired_permutation_test(first, second)
-    with pytest.raises(ValueError, match="4 and 3 values make no pairs"):
-        paired_permutation_test(first, second[:3])
 
 
 def test_midranks_share_ties() -> None:

@@ -6,7 +6,7 @@ import pytest
 from ssmail.config.sections import LettersSpec
 from ssmail.data import letters
 from ssmail.data.trajectories import Floats
-from ssmail.evaluation.strokes import polyline_distances, stroke_distances
+from ssmail.evaluation.metrics import polyline_distances, stroke_distances
 
 BAR = np.stack([np.linspace(0, 1, 101), np.zeros(101)], axis=1)  # a stroke of length 1
 

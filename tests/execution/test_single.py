@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.data.expert_file import save
+from ssmail.data.expert_sets import save
 from ssmail.data.yjunction import generate
 from ssmail.execution import single
 from ssmail.execution.cells import Cell, Event, Job, Resume, Settings

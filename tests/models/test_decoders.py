@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ssmail.models.decoders import ActivatedMessages, MessageDecoder, RecurrentDecoder, make_decoder
-from ssmail.models.edge_layers import TANH
+from ssmail.models.fast_messages import TANH
 from tests.models.test_message_passing import one_hot_graph
 from tests.models.test_variational_encoder import spec
 

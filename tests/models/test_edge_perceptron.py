@@ -3,8 +3,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssmail.models.edge_layers import between_different
-from ssmail.models.edge_perceptron import EdgePerceptron, FeatureNorm, ScaledEdges, edge_graph, elu
+from ssmail.models.fast_messages import between_different
+from ssmail.models.variational_encoder import EdgePerceptron, FeatureNorm, ScaledEdges, edge_graph, elu
 
 
 @given(n=st.integers(2, 6))

@@ -88,8 +88,8 @@ def test_a_spec_says_what_is_read() -> None:
     recorded = torch.rand(4, 50, 31, 6, generator=torch.Generator().manual_seed(0))
     features = Features.of(required(mocap.model), recorded)
     plain = Features(time=False, start=False, steps=50, root_relative=True, agents=31)
-    assert replace(features, standards=None) == plain
-    assert features.standards is not None
+    assert replace(features, normalization=None) == plain
+    assert features.normalization is not None
 
 
 def test_dnri_reads_on_mocap_what_the_policy_reads() -> None:
@@ -109,7 +109,7 @@ def test_standardized_training_states_have_mean_zero_and_spread_one() -> None:
     experts = scale * torch.rand(20, 30, 4, 6, generator=generator) + shift
     spec = required(build_spec("ssail", "mocap", "smoke").model)
     features = Features.of(spec, experts)
-    x, plain = (f(experts, experts[:, 0])[..., :6] for f in (features, replace(features, standards=None)))
+    x, plain = (f(experts, experts[:, 0])[..., :6] for f in (features, replace(features, normalization=None)))
     std, mean = torch.std_mean(x.flatten(0, 1), dim=0)
     assert torch.equal(x[:, :, 0, :3], torch.zeros(20, 30, 3))
     assert float(mean.abs().max()) < 1e-3
@@ -125,6 +125,6 @@ def test_actions_are_read_in_the_units_of_velocities_and_come_back() -> None:
     velocity = experts[..., 2:]
     torch.testing.assert_close(features.of_actions(velocity), features(experts, experts[:, 0])[..., 2:4])
     torch.testing.assert_close(features.to_actions(features.of_actions(velocity)), velocity)
-    plain = replace(features, standards=None)
+    plain = replace(features, normalization=None)
     assert plain.of_actions(velocity) is velocity
     assert plain.to_actions(velocity) is velocity

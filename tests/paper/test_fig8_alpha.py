@@ -158,7 +158,7 @@ def test_another_environment_has_its_own_runs_and_error(
 
 
 def test_what_cannot_be_drawn_is_said(store: Store, add_run: Any) -> None:
-    with pytest.raises(NoRuns, match="no run of it on mocap; run `ssmail ablate alpha --profile quick --seeds 0-4`"):
+    with pytest.raises(NoRuns, match="no run of the ablation alpha on mocap; run `ssmail ablate alpha --profile quick"):
         fig8_alpha.collect(store)
     with pytest.raises(NoRuns, match="on yjunction; run `ssmail ablate alpha --env yjunction --profile quick --seeds"):
         fig8_alpha.collect(store, environment="yjunction")

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from PIL import Image, ImageChops
 
 from ssmail.config.sections import YJunctionSpec
-from ssmail.data import expert_file, yjunction
-from ssmail.data.mocap.dataset import MocapParameters, make_expert_set, make_trajectories
+from ssmail.data import expert_sets, yjunction
+from ssmail.data.mocap.dataset import MocapParameters, bundle
+from ssmail.data.trajectories import Trajectories
 from ssmail.errors import InputError
 from ssmail.plots import provenance, skeleton, style
 from ssmail.plots.saving import save_figure
@@ -42,10 +43,10 @@ def data(tmp_path: Path) -> Path:
         positions = np.concatenate([walk(window, 0), walk(window, 20)])
         velocities = np.gradient(positions, axis=1)
         frames = np.array([2, 2 + window])
-        splits[split] = make_trajectories(positions, velocities, np.array([number, number]), frames)
+        splits[split] = Trajectories.single_mode(positions, velocities, np.array([number, number]), frames)
     params = MocapParameters(subject=7, train=(1,), validation=(2,), test=(3,), window=5, test_window=9)
     path = tmp_path / "mocap.npz"
-    expert_file.save(make_expert_set(splits, params, JOINTS, PARENTS, {}), path)
+    expert_sets.save(bundle(splits, params, JOINTS, PARENTS, {}), path)
     return path
 
 
@@ -58,7 +59,7 @@ def test_a_pose_is_seen_along_its_walk(data: Path) -> None:
     np.testing.assert_allclose(record.places[:, 4], np.stack([t / 2, np.full(9, 5)], axis=1), atol=1e-12)
     np.testing.assert_array_equal(record.shown, [0, 2, 4, 6, 8])
     assert (record.trial, record.first_frame, record.stem) == ("07_03", 2, "skeleton_test-0")
-    assert record.provenance.dataset_hashes == (expert_file.load(data).hash,)
+    assert record.provenance.dataset_hashes == (expert_sets.load(data).hash,)
     later = skeleton.collect(data, "train", 1)
     assert (later.trial, later.first_frame, later.stem) == ("07_01", 7, "skeleton_train-1")
     assert later.places[0, 0, 0] == pytest.approx(10)
@@ -153,7 +154,7 @@ def test_what_cannot_be_drawn_is_said(data: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"there is no file .*prep-mocap"):
         skeleton.collect(tmp_path / "absent.npz")
     lanes = YJunctionSpec(train=2, validation=2, test=2, agents=2, steps=50, lane_angle=43.0, jitter=1.0, seed=0)
-    expert_file.save(yjunction.generate(lanes), tmp_path / "lanes.npz")
+    expert_sets.save(yjunction.generate(lanes), tmp_path / "lanes.npz")
     with pytest.raises(InputError, match=r"lanes\.npz holds an expert set of yjunction, which .*prep-mocap"):
         skeleton.collect(tmp_path / "lanes.npz")
     (tmp_path / "broken.npz").write_bytes(data.read_bytes()[:1000])

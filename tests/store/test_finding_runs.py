@@ -1,10 +1,10 @@
-"""Runs found again: by what they are, by their ids, and by the figure that needs them."""
+"""Runs found again: by what they are, and by their ids."""
 
 from typing import Any
 
 import pytest
 
-from ssmail.config.experiments import FigureRequirements, ablation_specs, build_spec
+from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store
@@ -26,8 +26,7 @@ def test_filters(store: Store, spec: RunSpec) -> None:
     assert found(method="ssail", environment="yjunction", profile="smoke") == [0, 1]
     assert found(method="gail") == found(environment="mocap") == []
     assert found(state=RunState.FAILED) == found(state="failed") == [1]
-    assert found(figure="fig4") == [0, 1, 2]
-    assert found(figure="fig4", profile="smoke", state="running") == [0]
+    assert found(profile="smoke", state="running") == [0]
     assert found(ids=[ids[2], ids[0][:8].upper()]) == [0, 2]
     assert found(ids=[]) == []
 
@@ -42,18 +41,3 @@ def test_unknown_and_ambiguous_ids(store: Store, spec: RunSpec) -> None:
             store.runs(ids=[unknown])
     with pytest.raises(InputError, match="there is no run zz"):
         store.resume_run("zz", 0)
-
-
-def test_a_figure_keeps_only_its_methods(store: Store, spec: RunSpec, monkeypatch: pytest.MonkeyPatch) -> None:
-    store.start_run(spec, 0, dataset_hash=None, device="cpu")
-    required = FigureRequirements("yjunction", ("gail",))
-    monkeypatch.setattr("ssmail.config.experiments.figure_requirements", lambda name: required)
-    assert store.runs(figure="fig4") == []
-
-
-def test_a_figure_of_an_ablation_keeps_only_its_specs(store: Store) -> None:
-    inside = ablation_specs("beta", "smoke", [0.15])[0.15]
-    for one in (inside, *ablation_specs("beta", "smoke", [0.123]).values()):
-        store.start_run(one, 0, dataset_hash=None, device="cpu")
-    assert [row.spec_hash for row in store.runs(figure="fig6")] == [inside.hash()]
-    assert len(store.runs(figure="fig4")) == 2

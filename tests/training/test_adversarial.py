@@ -24,8 +24,8 @@ def test_learning_rates_go_geometrically_from_first_to_final() -> None:
     last_epoch = made.training.epochs - 1
 
     def rates(epoch: int) -> dict[str, float]:
-        made.rates.set(epoch)
-        return {name: o.param_groups[0]["lr"] for name, o in made.rates.optimizers.items()}
+        made.schedule.set(epoch)
+        return {name: o.param_groups[0]["lr"] for name, o in made.schedule.optimizers.items()}
 
     first, middle, last = rates(0), rates(last_epoch // 2), rates(last_epoch)
     assert first["actor"] == made.actor_critic.spec.actor_learning_rate
@@ -37,11 +37,11 @@ def test_learning_rates_go_geometrically_from_first_to_final() -> None:
 def test_only_states_and_actions_are_blurred() -> None:
     made, loop = learner("adversarial.input_noise=0.1", "model.time_input=true")
     x = made.features(loop.experts.states[:, :-1], loop.experts.states[:, 0])
-    blurred = made._blurred(x, features=4)
+    blurred = made._add_input_noise(x, features=4)
     torch.testing.assert_close(blurred[..., 4:], x[..., 4:], rtol=0, atol=0)
     assert float((blurred - x)[..., :4].std()) == pytest.approx(0.1, rel=0.05)
     sharp, _ = learner("adversarial.input_noise=0")
-    assert torch.equal(sharp._blurred(x, features=4), x)
+    assert torch.equal(sharp._add_input_noise(x, features=4), x)
 
 
 def test_tau_alpha_lies_between_its_pair() -> None:

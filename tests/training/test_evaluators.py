@@ -9,12 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.data import expert_file
-from ssmail.data.mocap.dataset import SPLITS, MocapParameters, make_expert_set, make_trajectories
+from ssmail.data import expert_sets
+from ssmail.data.mocap.dataset import MocapParameters, bundle
+from ssmail.data.trajectories import SPLITS, Trajectories
 from ssmail.errors import InputError
+from ssmail.training.baselines import Baseline, CopyLast
 from ssmail.training.evaluators import ForecastEvaluator
 from ssmail.training.loop import TrainingLoop
-from ssmail.training.references import CopyLast, Stateless
 from tests.training.conftest import ToySpec
 
 SHORT = ("forecast.observed=3", "forecast.predicted=5")
@@ -35,9 +36,9 @@ def falling(tmp_path: Path) -> str:
         velocities = draw.normal(size=(3, 1, 2, 3)) + PULL * np.arange(frames).reshape(1, -1, 1, 1)
         positions = draw.normal(size=(3, 1, 2, 3)) + velocities.cumsum(axis=1)
         count = np.zeros(3, dtype=np.int64)
-        splits[split] = make_trajectories(positions, velocities, count, count)
+        splits[split] = Trajectories.single_mode(positions, velocities, count, count)
     params = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,), window=6, test_window=8)
-    expert_file.save(make_expert_set(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
+    expert_sets.save(bundle(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
     return f"data.path={tmp_path / 'falling.npz'}"
 
 
@@ -60,7 +61,7 @@ def test_constant_velocity_against_the_answer_by_hand(falling: str, toy: ToySpec
     assert values["test_constant_velocity/fde"] == pytest.approx(distance[-1], rel=1e-3)
     is_constant_velocity = np.allclose(arrays["test/mse"], expected, rtol=1e-3)
     assert is_constant_velocity is (method == "constant-velocity")  # negative control: not everybody's answer
-    every_epoch = loop.evaluator.epoch(loop.evaluator.reference)  # from the first of six frames: five steps too
+    every_epoch = loop.evaluator.epoch(loop.evaluator.constant_velocity)  # from the first of six frames: five steps too
     assert every_epoch["validation/mse"] == pytest.approx(expected.mean(), rel=1e-3)
     assert every_epoch["train/mse"] == pytest.approx(expected.mean(), rel=1e-3)
 
@@ -78,7 +79,7 @@ def test_a_reference_has_one_answer_as_a_method_and_beside_others(toy: ToySpec, 
     assert values["test_noisy/mse"] > values["test/mse"]
 
 
-class Listener(Stateless):
+class Listener(Baseline):
     """Copies the last state and keeps the noise that it is given."""
 
     def __init__(self) -> None:
@@ -95,7 +96,7 @@ class Listener(Stateless):
 
 def noise_of(loop: TrainingLoop) -> Tensor:
     listener = Listener()
-    loop.evaluator.final(listener, listener)
+    loop.evaluator.final(listener, listener, listener)
     assert listener.heard[False] is None
     noise = listener.heard[True]
     assert noise is not None

@@ -9,6 +9,7 @@ import torch
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import METHODS, RunSpec
+from ssmail.training.evaluators import LetterEvaluator
 from ssmail.training.loop import TrainingLoop
 
 
@@ -62,10 +63,16 @@ def test_every_method_draws(method: str) -> None:
     assert loop.final_evaluation()[0]["test/stroke_distance"] > 0
 
 
+def untrained_rollouts(loop: TrainingLoop) -> dict[str, np.ndarray]:
+    """Those that the evaluator would draw if the current policy were the untrained one."""
+    assert isinstance(loop.evaluator, LetterEvaluator)
+    return loop.evaluator._untrained_rollouts(loop.learner.predictor, loop.evaluator.states(loop.data.test))
+
+
 def test_the_untrained_policy_is_that_of_before_training_even_in_a_resumed_run(tmp_path: Path) -> None:
     """And it stays in the lower half by its mean; the trained one is another (negative control)."""
     loop = TrainingLoop(toy("ssail"), 3)
-    before = loop.evaluator.beginning(loop.learner.predictor)
+    before = untrained_rollouts(loop)
     loop.run_epoch()
     torch.save(loop.state_dict(), tmp_path / "state.pt")
     resumed = TrainingLoop(toy("ssail"), 3)
@@ -74,13 +81,13 @@ def test_the_untrained_policy_is_that_of_before_training_even_in_a_resumed_run(t
     for name in ("initial/rollouts", "initial_mean/rollouts"):
         np.testing.assert_array_equal(arrays[name], before[name])
     assert arrays["initial_mean/rollouts"][..., 1].max() < 0
-    after = resumed.evaluator.beginning(resumed.learner.predictor)
+    after = untrained_rollouts(resumed)
     assert not np.array_equal(after["initial/rollouts"], before["initial/rollouts"])
 
 
 def test_looking_at_the_untrained_policy_changes_no_number() -> None:
     plain, curious = TrainingLoop(toy("bc"), 0), TrainingLoop(toy("bc"), 0)
-    curious.evaluator.beginning(curious.learner.predictor)
+    untrained_rollouts(curious)
     first, second = ({k: v for k, v in loop.run_epoch().items() if k != "seconds"} for loop in (plain, curious))
     assert first == second
 

@@ -95,7 +95,7 @@ def test_the_alpha_range_leaves_weights_and_data_order_alone(spec: RunSpec) -> N
 
 def test_complete_forcing_keeps_the_expert_states(spec: RunSpec) -> None:
     learner = adversarial(TrainingLoop(spec, 0))
-    experts, steps = learner.experts, learner.setting.steps
+    experts, steps = learner.experts, learner.context.steps
     batch, interventions = learner.generate(1.0)
     assert mean_segment_length(interventions) == 1
     torch.testing.assert_close(batch.states[:, :steps], experts.states[batch.source][:, :steps])

@@ -119,7 +119,7 @@ def acting(
 def test_the_encoder_remembers_what_was_observed_as_if_it_had_read_all_in_one_pass(
     noise: Tensor | None, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ssmail.training.rollout.READ_AT_ONCE", at_once)
+    monkeypatch.setattr("ssmail.training.rollout.ENCODER_CHUNK", at_once)
     policy, made = acting(OBSERVED, noise)
     read = torch.cat([OBSERVED[:, :-1], made.states[:, :-1]], dim=1) + (0 if noise is None else noise)
     with torch.no_grad():

@@ -26,7 +26,7 @@ def graphs_of(made: VariationalLearner, states: torch.Tensor) -> torch.Tensor:
 def test_all_steps_at_once_equal_step_by_step(method: str, decoder: str) -> None:
     """Complete forcing takes the short way; one step without an intervention, the last, forces the long one."""
     made = learner(method, f"variational.decoder={decoder}")
-    states = made.setting.experts.states[:3, :-1]
+    states = made.context.experts.states[:3, :-1]
     graphs = graphs_of(made, states)
     always = torch.ones(3, states.shape[1], dtype=torch.bool)
     once_free = always.clone()
@@ -38,7 +38,7 @@ def test_all_steps_at_once_equal_step_by_step(method: str, decoder: str) -> None
 
 def test_without_interventions_only_the_first_state_is_read() -> None:
     made = learner("dnri")
-    states = made.setting.experts.states[:2, :-1]
+    states = made.context.experts.states[:2, :-1]
     graphs = graphs_of(made, states)
     other = states.clone()
     other[:, 1:] += 1
@@ -54,7 +54,7 @@ def test_a_rollout_of_dnri_follows_its_prior_and_nri_keeps_one_graph(monkeypatch
         calls = []
         sample = type(made.model).sample
         monkeypatch.setattr(type(made.model), "sample", lambda *a, s=sample, c=calls: (c.append(1), s(*a))[1])
-        made.predictor.free_run(made.setting.experts.states[:2, :1], 5, torch.Generator())
+        made.predictor.free_run(made.context.experts.states[:2, :1], 5, torch.Generator())
         monkeypatch.undo()
         assert len(calls) == drawn
 
@@ -62,8 +62,8 @@ def test_a_rollout_of_dnri_follows_its_prior_and_nri_keeps_one_graph(monkeypatch
 def test_predicting_leaves_the_model_in_training_mode_and_its_statistics_alone() -> None:
     made = learner()
     before = deepcopy(made.model.state_dict())
-    made.predictor.free_run(made.setting.experts.states[:2, :1], 3, torch.Generator())
-    made.predictor.one_step(made.setting.experts.states[:2], torch.Generator())
+    made.predictor.free_run(made.context.experts.states[:2, :1], 3, torch.Generator())
+    made.predictor.one_step(made.context.experts.states[:2], torch.Generator())
     assert made.model.training
     for name, value in made.model.state_dict().items():
         assert torch.equal(value, before[name]), name
@@ -74,7 +74,7 @@ def test_predicting_leaves_the_model_in_training_mode_and_its_statistics_alone()
 def test_one_step_prediction_reads_the_past_only() -> None:
     for method in ("nri", "dnri"):
         made = learner(method)
-        states = made.setting.experts.states[:2]
+        states = made.context.experts.states[:2]
         other = states.clone()
         other[:, 20:] += 0.5
         first, second = (made.predictor.one_step(s, torch.Generator().manual_seed(0)) for s in (states, other))
@@ -107,7 +107,7 @@ def test_a_little_training_beats_constant_velocity_by_one_step(method: str) -> N
 def test_dnri_has_read_what_was_observed_as_in_one_pass(noise: float) -> None:
     """Its prior, and the memory of a recurrent decoder."""
     made, h, steps = learner("dnri", "variational.decoder=recurrent"), 4, 3
-    observed = made.setting.experts.states[:2, :h]
+    observed = made.context.experts.states[:2, :h]
     for p in made.model.parameters():
         p.data += 0.2 * torch.randn(p.shape, generator=torch.Generator().manual_seed(p.numel()))
     draw = torch.Generator().manual_seed(0)
@@ -127,7 +127,7 @@ def test_dnri_has_read_what_was_observed_as_in_one_pass(noise: float) -> None:
 
 def test_nri_infers_its_graph_from_all_that_was_observed(monkeypatch: pytest.MonkeyPatch) -> None:
     made, noise = learner("nri"), torch.randn(2, 8, 3, 4, generator=torch.Generator().manual_seed(0))
-    observed, seen = made.setting.experts.states[:2, :6], []
+    observed, seen = made.context.experts.states[:2, :6], []
     posterior = made.model.past_logits
     monkeypatch.setattr(made.model, "past_logits", lambda states: (seen.append(states), posterior(states))[1])
     made.predictor.free_run(observed, 3, torch.Generator(), noise=noise)
@@ -139,11 +139,11 @@ def test_nri_infers_its_graph_from_all_that_was_observed(monkeypatch: pytest.Mon
 def test_predictions_in_parts_are_those_of_all_at_once(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Parts of two of five trajectories and noise of their own; parts that share what is drawn would differ."""
     made = learner(method, "variational.decoder=recurrent")
-    observed = made.setting.experts.states[:5, :6]
+    observed = made.context.experts.states[:5, :6]
     added = 0.1 * torch.randn(5, 8, *observed.shape[2:], generator=torch.Generator().manual_seed(1))
     found = []
     for at_once in (16, 2):
-        monkeypatch.setattr("ssmail.training.variational.AT_ONCE", at_once)
+        monkeypatch.setattr("ssmail.training.variational.PREDICTION_CHUNK", at_once)
         draw = torch.Generator().manual_seed(0)
         found.append((made.predictor.free_run(observed, 3, draw, noise=added), made.predictor.one_step(observed, draw)))
     for whole, parts in zip(*found, strict=True):

@@ -94,14 +94,6 @@ def ablation_specs(
     return _ablation_specs(experiments, _read_ablation(experiments, name, environment), profile, values, overrides)
 
 
-def ablation_hashes(name: str, environment: str | None = None, file: Path | None = None) -> list[str]:
-    """The hashes of the ablation's specs in every profile, on its own environment or another one."""
-    experiments = load_experiments(file)
-    wanted = _read_ablation(experiments, name, environment)
-    found = (_ablation_specs(experiments, wanted, profile, None, ()) for profile in experiments.profiles)
-    return [spec.hash() for specs in found for spec in specs.values()]
-
-
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
     """The runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
     experiments = load_experiments(file)

@@ -232,7 +232,7 @@ class EvaluationSpec(Frozen):
     # an epoch whose validation lane_balance is below is best only while none reaches it
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
     # landscapes of the reward that are kept, evenly over the epochs, beside those of the untrained and of the current
-    # model (training.landscapes); null: that of the last epoch alone
+    # model (training.landscape_recorder); null: that of the last epoch alone
     landscapes: Count | None
 
 

@@ -1,1 +1,1 @@
-"""Expert trajectories: made, scaled, saved."""
+"""Expert trajectories: generated or recorded, scaled, saved."""

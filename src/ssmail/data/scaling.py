@@ -1,4 +1,4 @@
-"""Scaling of positions and velocities to [-1, 1] (appendix B; DNRI's protocol: one scalar range for each)."""
+"""Min-max scaling of positions and velocities to [-1, 1] (appendix B; as in DNRI, one scalar range for each)."""
 
 from dataclasses import dataclass
 from typing import Any, Self
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Scaling:
-    """One scalar minimum and maximum of the training positions, and one of the velocities, over all axes."""
+    """The minimum and maximum of the training positions and velocities over all agents and axes, in raw units."""
 
     position_min: float
     position_max: float
@@ -18,7 +18,7 @@ class Scaling:
 
     @classmethod
     def fit(cls, positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> Self:
-        """Ranges of arrays of any shape in raw units. Raises ValueError when a range is empty or not finite."""
+        """Fit to arrays of any shape in raw units. Raises ValueError if a range is empty or not finite."""
         scaling = cls(*(float(f(x)) for x in (positions, velocities) for f in (np.min, np.max)))
         spans = (scaling.position_span, scaling.velocity_span)
         if not all(np.isfinite(s) and s > 0 for s in spans):
@@ -27,26 +27,26 @@ class Scaling:
 
     @property
     def position_span(self) -> float:
-        """Raw length that two scaled units stand for."""
+        """The raw length of two scaled units."""
         return self.position_max - self.position_min
 
     @property
     def velocity_span(self) -> float:
-        """Raw speed that two scaled units stand for."""
+        """The raw speed of two scaled units."""
         return self.velocity_max - self.velocity_min
 
     def scale_positions(self, raw: Any) -> Any:
-        """Raw to scaled positions; arrays and tensors of any shape."""
+        """Scale raw positions; works on arrays and tensors of any shape."""
         return 2 * (raw - self.position_min) / self.position_span - 1
 
     def scale_velocities(self, raw: Any) -> Any:
-        """Raw to scaled velocities; arrays and tensors of any shape."""
+        """Scale raw velocities; works on arrays and tensors of any shape."""
         return 2 * (raw - self.velocity_min) / self.velocity_span - 1
 
     def unscale_positions(self, scaled: Any) -> Any:
-        """Scaled to raw positions; inverse of `scale_positions`."""
+        """Invert `scale_positions`."""
         return (scaled + 1) * (self.position_span / 2) + self.position_min
 
     def unscale_velocities(self, scaled: Any) -> Any:
-        """Scaled to raw velocities; inverse of `scale_velocities`."""
+        """Invert `scale_velocities`."""
         return (scaled + 1) * (self.velocity_span / 2) + self.velocity_min

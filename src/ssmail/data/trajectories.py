@@ -1,27 +1,35 @@
-"""Expert trajectories as arrays, whichever environment they come from."""
+"""Expert trajectories as arrays, for every environment."""
 
-from collections.abc import Mapping
+import hashlib
+import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ssmail.config.sections import LettersSpec, YJunctionSpec
 from ssmail.data.scaling import Scaling
 
-Floats = NDArray[np.float64]
+Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes
 Integers = NDArray[np.int64]
 SPLITS = ("train", "validation", "test")
+FIELDS = {  # environment -> the arrays of a split that are hashed and stored, in this order; the rest follows from them
+    "yjunction": ("positions", "velocities", "mode", "continuations"),
+    "letters": ("positions", "velocities", "mode"),
+    "mocap": ("positions", "velocities", "mode", "trial", "frame"),
+}
 
 
 @dataclass(frozen=True)
 class Trajectories:
-    """B trajectories of N agents over T steps in raw units.
+    """B trajectories of N agents over T steps, in raw units.
 
     positions, velocities: (B, T, N, P) with velocities[:, t] = positions[:, t] - positions[:, t - 1] for t >= 1.
-    mode: (B,) index of the mode that each trajectory follows, 0 where the environment has only one.
-    continuations: (L, B, T, N, P) positions of the expert from the same starts into each of its L modes.
-    trial, frame: (B,) of recorded motion, the trial that each was cut from and the number of its first frame there;
-    None for an expert that was not recorded.
+    mode: (B,) index of the expert's mode that each trajectory follows; 0 if the environment has only one.
+    continuations: (L, B, T, N, P) the expert's positions from the same starts into each of its L modes.
+    trial, frame: (B,) for recorded motion, the trial that each trajectory was cut from and the number of its first
+    frame there; None otherwise.
     """
 
     positions: Floats
@@ -31,11 +39,19 @@ class Trajectories:
     trial: Integers | None = None
     frame: Integers | None = None
 
+    @classmethod
+    def single_mode(
+        cls, positions: Floats, velocities: Floats, trial: Integers | None = None, frame: Integers | None = None
+    ) -> "Trajectories":
+        """Trajectories (B, T, N, P) of an expert with one mode: the continuation is the trajectory itself."""
+        mode = np.zeros(len(positions), dtype=np.int64)
+        return cls(positions, velocities, mode, positions[None], trial, frame)
+
     def __len__(self) -> int:
         return len(self.positions)
 
     def __getitem__(self, index: Integers) -> "Trajectories":
-        """Those trajectories of which `index` holds the positions in the set."""
+        """Return the trajectories at the positions `index` of the set."""
         return Trajectories(
             self.positions[index],
             self.velocities[index],
@@ -48,15 +64,15 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class ExpertSet:
-    """The three splits of an environment's expert data, with what identifies them.
+    """The three splits of an environment's expert data, and what identifies them.
 
-    centre_lines: (L, P', P) points of each mode's centre line in raw units; of letters, (N, P', P) the letter that each
-    agent draws; empty where there is none.
-    parameters: what made the set; its "environment", where absent, is yjunction.
-    hash: SHA-256 of the arrays and of the parameters that made them, and of the skeleton.
-    joints, parents: names of the N agents where they are the joints of a skeleton, and for each the one that it hangs
-    on, -1 for the root; empty for agents of other kinds.
-    sources: files that the set was made from, with their SHA-256; a record that is no part of `hash`.
+    centre_lines: (L, P', P) points of each mode's centre line in raw units; for letters, (N, P', P) the letter that
+    each agent draws; empty for recorded motion.
+    parameters: what the set was made from. Without an "environment" it is a yjunction set.
+    hash: SHA-256 of the parameters, the skeleton and the arrays.
+    joints, parents: for the joints of a skeleton, their N names and the index of each one's parent, -1 for the root;
+    empty for other agents.
+    sources: the files that the set was made from, with their SHA-256; not part of `hash`.
     """
 
     train: Trajectories
@@ -69,6 +85,28 @@ class ExpertSet:
     parents: tuple[int, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
 
+    @classmethod
+    def bundle(
+        cls,
+        splits: Mapping[str, Trajectories],
+        centre_lines: Floats,
+        parameters: Mapping[str, object],
+        joints: tuple[str, ...] = (),
+        parents: tuple[int, ...] = (),
+        sources: Mapping[str, str] | None = None,
+    ) -> "ExpertSet":
+        """Put the splits together and compute their hash. The sources stay out of it: the same numbers from files with
+        other line ends are the same data.
+        """
+        described = [parameters, joints, parents] if joints else parameters
+        digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        fields = FIELDS[str(parameters.get("environment", "yjunction"))]
+        for array in (*(getattr(splits[split], name) for split in SPLITS for name in fields), centre_lines):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        train, validation, test = (splits[split] for split in SPLITS)
+        made_from = dict(sources or {})
+        return cls(train, validation, test, centre_lines, parameters, digest.hexdigest(), joints, parents, made_from)
+
     @property
     def environment(self) -> str:
         """The environment that the set belongs to."""
@@ -76,5 +114,16 @@ class ExpertSet:
 
     @property
     def scaling(self) -> Scaling:
-        """Scaling to [-1, 1], fitted to the training split only."""
+        """The scaling to [-1, 1], fitted to the training split only."""
         return Scaling.fit(self.train.positions, self.train.velocities)
+
+
+def generate_splits(
+    params: LettersSpec | YJunctionSpec, generate: Callable[[int, np.random.Generator], Trajectories]
+) -> dict[str, Trajectories]:
+    """Generate as many trajectories for each split as `params` says, each split from a random stream of its own."""
+    seeds = np.random.SeedSequence(params.seed).spawn(len(SPLITS))
+    return {
+        split: generate(getattr(params, split), np.random.default_rng(seed))
+        for split, seed in zip(SPLITS, seeds, strict=True)
+    }

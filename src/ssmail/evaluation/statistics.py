@@ -1,38 +1,30 @@
-"""What a handful of seeds allows to say: centre and spread of a group of runs, and exact permutation tests.
+"""Centre and spread of a handful of runs.
 
-Runs that fail are not left out. Everywhere here NaN is *unknown* (nothing was recorded), and +inf is an error that is
-*worse than any other*: what a diverged run counts as. Hence
+Failed runs stay in the group. Everywhere here NaN means *unknown* (nothing was recorded), and +inf is an error *worse
+than any other*, which is what a diverged run counts as. Therefore:
 
-- a mean needs finite values: once a run diverged it has no number, and is NaN;
-- a median and its quartiles put +inf last, so they stay finite while few runs diverged; one unknown value makes them
-  NaN;
-- a permutation test on values refuses what is not finite; on ranks +inf is the last rank, shared by all that diverged:
-  a diverged run loses against each finite one, however far it went.
+- A mean needs finite values. Once a run has diverged, the mean is NaN.
+- A median and its quartiles sort +inf last and stay finite while few runs have diverged. One unknown value makes them
+  NaN.
 
-What five seeds cannot say: the least p of an exact two-sided test of 5 against 5 different values is 2/252 = 0.0079, of
-3 against 3 it is 2/20 = 0.1, and of 5 pairs 2/32 = 0.0625. Every test tells its own (`PermutationTest.least`).
+The tests in `hypothesis_tests` follow the same convention.
 """
 
 import math
 from enum import StrEnum
-from itertools import chain, combinations
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import stdtrit  # quantiles of Student's t without scipy.stats, which takes a second to import
 
-Floats = npt.NDArray[np.float64]
-Alternative = Literal["two-sided", "less", "greater"]
-Scale = Literal["values", "ranks"]
+from ssmail.data.trajectories import Floats
 
 CONFIDENCE = 0.95
-LARGEST = 200_000  # splits or sign patterns that a test enumerates at most: 10 against 10 runs, 17 pairs
-_ROUNDING = 1e-12  # differences that are equal but for this, relative to the largest value, count as ties
 
 
 class Statistic(StrEnum):
-    """Which centre and spread of a group of runs are shown."""
+    """Which centre and spread of a group of runs a figure shows."""
 
     MEAN_STD = "mean-std"
     MEDIAN_IQR = "median-iqr"
@@ -40,35 +32,26 @@ class Statistic(StrEnum):
 
     @property
     def centre(self) -> str:
-        """What the centre is called."""
+        """The name of the centre."""
         return "median" if self is Statistic.MEDIAN_IQR else "mean"
 
     @property
     def words(self) -> str:
-        """Centre and spread, for a legend."""
+        """The names of centre and spread, for a legend."""
         spread = {"mean-std": "± std", "median-iqr": "and quartiles", "mean-ci": f"and {CONFIDENCE:.0%} interval"}
         return f"{self.centre} {spread[self.value]}"
 
 
 class Summary(NamedTuple):
-    """Centre and spread of R runs, each of the shape that one run has."""
+    """Centre and spread of R runs, each with the shape of one run's values."""
 
     centre: Floats
     low: Floats
     high: Floats
 
 
-class PermutationTest(NamedTuple):
-    """What an exact permutation test found."""
-
-    difference: float  # observed: mean of the first group minus that of the second (of the ranks, on ranks)
-    p: float  # share of all splits at least as extreme, the observed one among them: never 0
-    least: float  # the smallest p that these values could have given, in whichever split
-    splits: int  # how many there are
-
-
 def summarise(values: npt.ArrayLike, statistic: Statistic) -> Summary:
-    """Centre, low and high of (R, ...) values over the R >= 1 runs: the rule of every figure; see the three below."""
+    """Return centre, low and high of (R, ...) values over R >= 1 runs, by one of the three statistics below."""
     if statistic is Statistic.MEDIAN_IQR:
         return median_quartiles(values)
     return mean_std(values) if statistic is Statistic.MEAN_STD else mean_interval(values)
@@ -83,10 +66,10 @@ def mean_std(values: npt.ArrayLike) -> Summary:
 
 
 def mean_interval(values: npt.ArrayLike, confidence: float = CONFIDENCE) -> Summary:
-    """Mean of (R, ...) and Student's t-interval of it: mean -+ t * std / sqrt(R), with R - 1 degrees of freedom.
+    """Mean of (R, ...) and its Student's t-interval: mean -+ t * std / sqrt(R), with R - 1 degrees of freedom.
 
-    It covers the mean of all seeds' runs with probability `confidence` (above 0, below 1) where the runs are normal.
-    A single run bounds nothing: its interval is (-inf, inf).
+    If the runs are normal, the interval covers the mean over all seeds with probability `confidence`. The interval of a
+    single run is (-inf, inf). Raises ValueError unless `confidence` lies between 0 and 1.
     """
     if not 0 < confidence < 1:
         raise ValueError(f"a confidence lies between 0 and 1, not {confidence}")
@@ -102,65 +85,13 @@ def mean_interval(values: npt.ArrayLike, confidence: float = CONFIDENCE) -> Summ
 
 def median_quartiles(values: npt.ArrayLike) -> Summary:
     """Median and quartiles of (R, ...), linear between order statistics; NaN where a value is NaN, +inf sorted last."""
-    table = np.sort(_table(values), axis=0)
+    table = np.sort(as_table(values), axis=0)
     low, centre, high = (_quantile(table, share) for share in (0.25, 0.5, 0.75))
     return Summary(centre, low, high)
 
 
-def permutation_test(
-    first: npt.ArrayLike, second: npt.ArrayLike, alternative: Alternative = "two-sided", on: Scale = "values"
-) -> PermutationTest:
-    """Exact test of two independent groups: is the difference of their means more than a random split would give?
-
-    All C(R1 + R2, R1) splits are enumerated. p is the share of them whose difference d is >= the observed one
-    ("greater"), <= it ("less"), or |d| >= its size ("two-sided"), ties included. `on` "ranks" takes midranks of the
-    pooled values first (Wilcoxon, Mann and Whitney), which makes +-inf usable. Raises ValueError for an empty group,
-    NaN, infinities on "values", and more than LARGEST splits.
-    """
-    a, b = _table(first), _table(second)
-    pooled = np.concatenate([a, b])
-    splits = math.comb(len(pooled), len(a))
-    _check(pooled, on, splits)
-    if on == "ranks":
-        pooled = midranks(pooled)
-    tolerance = _ROUNDING * np.abs(pooled).max()
-    centred = pooled - pooled.mean()
-    chosen = np.fromiter(chain.from_iterable(combinations(range(len(pooled)), len(a))), dtype=np.intp)
-    sums = centred[chosen.reshape(splits, len(a))].sum(axis=1)  # (splits,), the observed split first
-    return _result(sums / len(a) - (centred.sum() - sums) / len(b), tolerance, alternative)
-
-
-def paired_permutation_test(
-    first: npt.ArrayLike, second: npt.ArrayLike, alternative: Alternative = "two-sided", on: Scale = "values"
-) -> PermutationTest:
-    """Exact test of pairs, such as runs of one seed under two specs: all 2 ** R signs of their R differences.
-
-    p as in `permutation_test`, of the mean difference; on "ranks", of the mean signed midrank of the sizes (Wilcoxon;
-    pairs without a difference keep their rank, of sign 0: Pratt). Two equal infinities differ by 0. Raises ValueError
-    for unequal lengths, no pair, NaN, infinities on "values", and more than LARGEST sign patterns.
-    """
-    a, b = _table(first), _table(second)
-    if len(a) != len(b):
-        raise ValueError(f"{len(a)} and {len(b)} values make no pairs")
-    _check(np.concatenate([a, b]), on, 2 ** len(a))
-    same = a == b
-    differences = np.where(same, 0.0, a - np.where(same, 0.0, b))
-    tolerance = _ROUNDING * max(np.abs(a).max(), np.abs(b).max())
-    if on == "ranks":
-        differences = np.sign(differences) * midranks(np.abs(differences))
-        tolerance = _ROUNDING * len(a)
-    patterns = np.arange(2 ** len(a))[:, None] >> np.arange(len(a)) & 1  # (2 ** R, R), the observed signs first
-    return _result((1 - 2 * patterns) @ differences / len(a), tolerance, alternative)
-
-
-def midranks(values: npt.ArrayLike) -> Floats:
-    """Ranks from 1 of (R,) values; equal ones, equal infinities too, share the mean of their ranks."""
-    _, place, counts = np.unique(_table(values), return_inverse=True, return_counts=True)
-    ranks: Floats = (np.cumsum(counts) - (counts - 1) / 2)[place]
-    return ranks
-
-
-def _table(values: npt.ArrayLike) -> Floats:
+def as_table(values: npt.ArrayLike) -> Floats:
+    """Return values (R, ...) as an array. Raises ValueError if there is none."""
     table = np.asarray(values, dtype=np.float64)
     if not table.ndim or not len(table):
         raise ValueError("a statistic needs at least one value")
@@ -169,7 +100,7 @@ def _table(values: npt.ArrayLike) -> Floats:
 
 def _finite_columns(values: npt.ArrayLike) -> Floats:
     """The table, NaN throughout where the value of any run is not finite."""
-    table = _table(values)
+    table = as_table(values)
     finite: Floats = np.where(np.isfinite(table).all(axis=0), table, np.nan)
     return finite
 
@@ -181,19 +112,3 @@ def _quantile(ordered: Floats, share: float) -> Floats:
     with np.errstate(invalid="ignore"):  # between -inf and inf there is no number
         between = np.where(lower == upper, lower, (1 - part) * lower + part * upper) if part else lower
     return np.where(np.isnan(ordered[-1]), np.nan, between)  # NaN is sorted last
-
-
-def _check(pooled: Floats, on: Scale, splits: int) -> None:
-    if pooled.ndim != 1 or np.isnan(pooled).any():
-        raise ValueError("a permutation test takes one known number for each run")
-    if on == "values" and not np.isfinite(pooled).all():
-        raise ValueError("means have no place for infinite values; test on ranks, where a diverged run is the worst")
-    if splits > LARGEST:
-        raise ValueError(f"{splits} splits are too many to enumerate; {LARGEST} are the most")
-
-
-def _result(differences: Floats, tolerance: float, alternative: Alternative) -> PermutationTest:
-    """From the difference of every split, the observed one first."""
-    extremity = {"two-sided": np.abs(differences), "greater": differences, "less": -differences}[alternative]
-    p, least = (float(np.mean(extremity >= bound - tolerance)) for bound in (extremity[0], extremity.max()))
-    return PermutationTest(float(differences[0]), p, least, len(differences))

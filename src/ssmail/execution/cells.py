@@ -9,7 +9,7 @@ from typing import Any, Literal, Self
 
 from ssmail.config.spec import RunSpec
 from ssmail.config.user_functions import load_label
-from ssmail.data.expert_file import load
+from ssmail.data.expert_sets import load
 from ssmail.errors import InputError
 from ssmail.store import HEARTBEAT_SECONDS, STALE_SECONDS, RunRow, RunState, Store, is_alive
 from ssmail.store.lifecycle import refusal

@@ -1,4 +1,4 @@
-"""Twin critics of G-SAC: one pass, two independent sets of weights."""
+"""The twin critics of G-SAC (section 3.2.2)."""
 
 import math
 
@@ -10,7 +10,7 @@ from ssmail.models.message_passing import TypedMessages
 
 
 class TwinLinear(nn.Module):
-    """Two linear layers side by side: (..., 2, D) -> (..., 2, H)."""
+    """Two independent linear layers in one operation: (..., 2, D) -> (..., 2, H)."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -19,14 +19,15 @@ class TwinLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(2, outputs).uniform_(-bound, bound))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply weight k to x[..., k, :]."""
+        """Apply layer k to x[..., k, :]."""
         return torch.einsum("...kd,kdh->...kh", x, self.weight) + self.bias
 
 
 class TwinCritic(nn.Module):
-    """Q_1 and Q_2 of each agent, given all agents' states and actions and the graph.
+    """Q_1 and Q_2 of each agent, given the states and actions of all agents and the graph.
 
-    Each agent has its own return (the discriminator scores every agent), learned from the messages of all others.
+    Each agent has a return of its own, because the discriminator scores every agent; the messages of the others inform
+    its value.
     """
 
     def __init__(self, inputs: int, spec: ModelSpec) -> None:
@@ -38,9 +39,10 @@ class TwinCritic(nn.Module):
         self.last = TwinLinear(hidden, 1)
 
     def forward(self, x: Tensor, action: Tensor, graph: Tensor) -> Tensor:
-        """x (..., N, D), action (..., N, A), graph (..., N, N, K) -> (..., N, 2)."""
+        """Map x (..., N, D), action (..., N, A) and graph (..., N, N, K) to (..., N, 2)."""
         inputs = torch.cat([x, action], dim=-1)
         messages = [m(inputs, graph) for m in self.messages]
+        # (..., N, 2, H + D + A): both critics side by side
         h = torch.stack([torch.cat([m, inputs], dim=-1) if self.own_input else m for m in messages], dim=-2)
         h = torch.relu(self.first(h))
         h = torch.relu(self.second(h))

@@ -1,24 +1,25 @@
-"""The decoders of NRI and DNRI: the next velocity of each agent under a graph (Kipf et al. 2018, section 3.2).
+"""The decoders of NRI and DNRI: the next velocity of each agent, given a graph (Kipf et al. 2018, section 3.2).
 
-Each edge type has its own message perceptron, the messages of an agent are averaged over its senders, and the result is
-a residual on the agent's current velocity: untrained, a decoder is close to constant velocity. The original predicts a
-residual on the whole state; here the environment integrates the velocity (docs/paper.md), so that the position follows.
+Each edge type has its own message perceptron, the messages to an agent are averaged over its senders, and the result is
+a residual on the agent's current velocity: an untrained decoder predicts nearly constant velocity. The original has a
+residual on the whole state; here the environment integrates the velocity (docs/paper.md), so the position follows.
 
 Inputs x (B, T, N, F) begin with the state [position, velocity] of 2 * A features. Graphs are (B, T, N, N, K), sender
-first; their diagonal is ignored, and T may be 1: one graph for all steps.
+first; their diagonal is ignored. A graph with T = 1 holds for all steps.
 """
 
 import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import VariationalSpec
-from ssmail.models.edge_layers import RELU, TANH, Activation, EdgeLayers
+from ssmail.models import message_passing
+from ssmail.models.fast_messages import RELU, TANH, Activation, EdgeLayers
 from ssmail.models.graph_encoder import off_diagonal
 from ssmail.models.message_passing import PairLayer
 
 
 class PairPerceptron(nn.Module):
-    """act(W_2 act(W_s x_i + W_r x_j)) for the edge from i to j."""
+    """act(W_2 act(W_1 [x_i, x_j] + b_1) + b_2) for the edge from i to j."""
 
     def __init__(self, inputs: int, hidden: int, activation: Activation) -> None:
         super().__init__()
@@ -27,9 +28,13 @@ class PairPerceptron(nn.Module):
         self.activation = activation
 
     def forward(self, x: Tensor, weights: Tensor) -> Tensor:
-        """x (B, T, N, D) and weights (B, T, N, N - 1), receiver by receiver -> the weighted sum over senders
-        (B, T, N, H).
+        """Return the sum of the messages over senders (B, T, N, H), weighted with `weights` (B, T, N, N - 1), receiver
+        by receiver; x is (B, T, N, D).
         """
+        if not message_passing.FAST:
+            act = self.activation.plain
+            messages = act(self.second(act(self.first.gathered(x))))  # (B, T, N, N - 1, H)
+            return (weights.unsqueeze(-1) * messages).sum(dim=-2)
         sent, own = self.first.sender(x), self.first.receiver(x)
         second = self.second.weight, self.second.bias
         received: Tensor = EdgeLayers.apply(sent, own, None, None, *second, weights, self.activation)[1]  # type: ignore[no-untyped-call]  # torch's
@@ -37,9 +42,10 @@ class PairPerceptron(nn.Module):
 
 
 class ActivatedMessages(nn.Module):
-    """mean over senders i of sum_k z_ijk f_k([x_i, x_j]). Unlike in TypedMessages, f_k ends in an activation, as in
-    NRI, so that its second layer is applied to every pair. With `first_type_is_none` the first type has no f_k and
-    carries nothing.
+    """The mean over senders i of sum_k z_ijk f_k([x_i, x_j]).
+
+    Unlike in TypedMessages, f_k ends in an activation, as in NRI, so its second layer is applied to every edge. With
+    `first_type_is_none` the first type has no f_k and carries no messages.
     """
 
     def __init__(self, inputs: int, spec: VariationalSpec, activation: Activation) -> None:
@@ -51,15 +57,15 @@ class ActivatedMessages(nn.Module):
         )
 
     def weights(self, graph: Tensor) -> Tensor:
-        """(B, T, N, N, K) -> the weights of the messages of each type in the mean, receiver by receiver,
-        (B, T, N, N - 1, K or K - 1).
+        """Return z_ijk / (N - 1), receiver by receiver, (B, T, N, N - 1, K), without the type that carries no messages;
+        graph is (B, T, N, N, K).
         """
         n = graph.shape[2]
         edges = off_diagonal(graph[..., self.skipped :].transpose(2, 3))
         return edges.reshape(*edges.shape[:2], n, n - 1, edges.shape[-1]) / max(n - 1, 1)
 
     def forward(self, x: Tensor, weights: Tensor) -> Tensor:
-        """x (B, T, N, D) and weights (B, T, N, N - 1, K or K - 1) -> (B, T, N, H)."""
+        """Map x (B, T, N, D) and the `weights` of a graph to the messages received (B, T, N, H)."""
         received = x.new_zeros(*x.shape[:-1], self.size)
         if x.shape[2] == 1:
             return received
@@ -69,7 +75,7 @@ class ActivatedMessages(nn.Module):
 
 
 def motion_head(inputs: int, hidden: int, action_size: int) -> nn.Sequential:
-    """Three layers, the last one small at first: (..., inputs) -> (..., A)."""
+    """Three layers that map (..., inputs) to (..., A); the last one is initialized with small weights."""
     last = nn.Linear(hidden, action_size)
     with torch.no_grad():
         last.weight.mul_(0.1)
@@ -78,7 +84,7 @@ def motion_head(inputs: int, hidden: int, action_size: int) -> nn.Sequential:
 
 
 class MessageDecoder(nn.Module):
-    """For small systems: messages on the inputs of the two agents, nothing remembered."""
+    """For small systems: the messages read the inputs of the two agents; there is no memory."""
 
     def __init__(self, inputs: int, action_size: int, spec: VariationalSpec) -> None:
         super().__init__()
@@ -87,8 +93,9 @@ class MessageDecoder(nn.Module):
         self.head = motion_head(inputs + spec.decoder_hidden, spec.decoder_hidden, action_size)
 
     def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, None]:
-        """x (B, T, N, F), graph (B, T or 1, N, N, K) -> next velocities (B, T, N, A), all steps at once. `memory` is
-        that of RecurrentDecoder; here it is always None.
+        """Map x (B, T, N, F) and graph (B, T or 1, N, N, K) to next velocities (B, T, N, A), all steps at once.
+
+        `memory` is there for RecurrentDecoder's sake and always None.
         """
         received = self.messages(x, self.messages.weights(graph))
         a = self.action_size
@@ -96,9 +103,9 @@ class MessageDecoder(nn.Module):
 
 
 class RecurrentDecoder(nn.Module):
-    """For motion: messages on the hidden states of the two agents, and a gated update of each hidden state h.
+    """For motion: the messages read the hidden states of the two agents, and update each hidden state h through gates.
 
-    With m the messages: reset r = s(W_r x + V_r m), update z = s(W_z x + V_z m), candidate c = tanh(W_c x + r V_c m),
+    With the messages m: reset r = s(W_r x + V_r m), update z = s(W_z x + V_z m), candidate c = tanh(W_c x + r V_c m),
     h <- (1 - z) c + z h; s is the logistic function. Unlike in a GRU, h enters the gates through the messages only, as
     in NRI.
     """
@@ -112,8 +119,10 @@ class RecurrentDecoder(nn.Module):
         self.head = motion_head(self.size, self.size, action_size)
 
     def forward(self, x: Tensor, graph: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """x (B, T, N, F), graph (B, T or 1, N, N, K) -> next velocities (B, T, N, A), step after step from the hidden
-        states `memory` (B, N, H; None: zeros), and the hidden states after the last step.
+        """Map x (B, T, N, F) and graph (B, T or 1, N, N, K) to next velocities (B, T, N, A), step by step.
+
+        `memory` holds the hidden states (B, N, H) before the first step, zeros if None. Also returns those after the
+        last step.
         """
         b, t, n, _ = x.shape
         weights = self.messages.weights(graph).expand(b, t, -1, -1, -1)
@@ -127,7 +136,7 @@ class RecurrentDecoder(nn.Module):
         return x[..., a : 2 * a] + self.head(torch.stack(states, dim=1)), hidden
 
     def _update(self, hidden: Tensor, from_inputs: Tensor, weights: Tensor) -> Tensor:
-        """One step of the hidden states (B, N, H), given the weights (B, 1, N, N - 1, K or K - 1) of messages."""
+        """Advance the hidden states (B, N, H) by one step, given the weights (B, 1, N, N - 1, K) of its messages."""
         received = self.received(self.messages(hidden.unsqueeze(1), weights).squeeze(1))
         gates = torch.sigmoid(from_inputs[..., : 2 * self.size] + received[..., : 2 * self.size])
         reset, update = gates.chunk(2, dim=-1)
@@ -136,7 +145,7 @@ class RecurrentDecoder(nn.Module):
 
 
 def make_decoder(inputs: int, action_size: int, spec: VariationalSpec) -> MessageDecoder | RecurrentDecoder:
-    """The decoder that `spec` names, for F = `inputs` features of each agent."""
+    """Return the decoder that `spec` names, for F = `inputs` features of each agent."""
     if spec.decoder == "messages":
         return MessageDecoder(inputs, action_size, spec)
     return RecurrentDecoder(inputs, action_size, spec)

@@ -17,7 +17,7 @@ class Discriminator(nn.Module):
         )
 
     def forward(self, x: Tensor, action: Tensor) -> Tensor:
-        """x (..., N, D) and action (..., N, A) -> (..., N)."""
+        """Map x (..., N, D) and action (..., N, A) to unbounded scores (..., N)."""
         inputs = torch.cat([x, action], dim=-1)
         out: Tensor = self.head(torch.cat([self.edges.messages(inputs), inputs], dim=-1))
         return out.squeeze(-1)

@@ -1,5 +1,5 @@
-"""What every network reads of an agent at a step: its state and, by choice, the step index, its first state and which
-agent it is.
+"""Input features of all networks: an agent's state and, optionally, the step index, its first state and a one-hot of
+the agent.
 """
 
 from dataclasses import dataclass, replace
@@ -8,17 +8,17 @@ import torch
 from torch import Tensor
 
 from ssmail.config.sections import ModelSpec, VariationalSpec
-from ssmail.models.standards import Standards
+from ssmail.models.normalization import Normalization
 
 
 @dataclass(frozen=True)
 class Features:
-    """[state, time, first state, agent] per agent.
+    """Computes the features [state, time, first state, agent] of every agent.
 
-    steps: the trajectory length that the step index is scaled with: 0 .. steps - 1 -> -1 .. 1.
-    root_relative: positions are differences to those of agent 0, the root of a skeleton; its own are then zeros.
-    agents: N of the one-hot of the agent; 0 leaves it out.
-    standards: the units that an agent's state and action are read in; None leaves them in scaled units.
+    steps: the trajectory length; the step index 0 .. steps - 1 is scaled to -1 .. 1.
+    root_relative: take positions relative to agent 0, the root of a skeleton, whose own positions become zeros.
+    agents: the length N of the one-hot of the agent; 0 leaves it out.
+    normalization: per-agent normalization of states and actions; None leaves them in scaled units.
     """
 
     time: bool
@@ -26,23 +26,23 @@ class Features:
     steps: int
     root_relative: bool = False
     agents: int = 0
-    standards: Standards | None = None
+    normalization: Normalization | None = None
 
     @classmethod
     def of(cls, spec: ModelSpec | VariationalSpec, experts: Tensor) -> "Features":
-        """Those of a spec, for trajectories like the training set's: experts (M, T, N, D), scaled."""
+        """Return the features that a spec asks for, fitted to the training states `experts` (M, T, N, D), scaled."""
         steps, agents = experts.shape[1:3]
         plain = cls(False, False, steps, spec.root_relative, agents * spec.agent_input)
         if isinstance(spec, ModelSpec):
             plain = replace(plain, time=spec.time_input, start=spec.start_input)
-        return replace(plain, standards=Standards.of(plain._relative(experts))) if spec.standardize else plain
+        return replace(plain, normalization=Normalization.fit(plain._relative(experts))) if spec.standardize else plain
 
     def size(self, state_size: int) -> int:
-        """Number of features of an agent with D state features."""
+        """Return the number of features F of an agent with `state_size` state features."""
         return state_size * (1 + self.start) + self.time + self.agents
 
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
-        """states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) -> (B, T, N, F)."""
+        """Map states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) to (B, T, N, F)."""
         b, t, n, _ = states.shape
         parts = [self.read(states)]
         if self.time:
@@ -56,20 +56,20 @@ class Features:
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def of_actions(self, actions: Tensor) -> Tensor:
-        """Actions (..., N, A), which are velocities, in the units that they are read in."""
-        return actions if self.standards is None else self.standards.velocity.standardize(actions)
+        """Convert actions (..., N, A), which are velocities, from scaled units to the networks' units."""
+        return actions if self.normalization is None else self.normalization.velocity.normalize(actions)
 
     def to_actions(self, read: Tensor) -> Tensor:
-        """Actions (..., N, A) in scaled units from what a network says in those that it reads."""
-        return read if self.standards is None else self.standards.velocity.restore(read)
+        """Convert a network's actions (..., N, A) to scaled units."""
+        return read if self.normalization is None else self.normalization.velocity.denormalize(read)
 
     def read(self, states: Tensor) -> Tensor:
-        """States (..., N, 2P) in the units that they are read in."""
+        """Convert states (..., N, 2P) from scaled units to the networks' units."""
         relative = self._relative(states)
-        return relative if self.standards is None else self.standards.standardize(relative)
+        return relative if self.normalization is None else self.normalization.normalize(relative)
 
     def _relative(self, states: Tensor) -> Tensor:
-        """States (..., N, 2P) with the positions that are read."""
+        """Take the positions of states (..., N, 2P) relative to the root, if asked for."""
         if not self.root_relative:
             return states
         position, velocity = states.chunk(2, dim=-1)

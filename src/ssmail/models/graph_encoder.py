@@ -1,9 +1,9 @@
 """The graph encoder (section 3.2.1): node -> edge -> node -> edge messages, an LSTM per edge, a softmax over edge
 types.
 
-As in the paper there is no prior network. How the graph is *sampled* is left open there, and it matters: the sampled
-graph is all the randomness that a whole group shares. A graph is the arg max of logits plus Gumbel noise; `GraphNoise`
-says for how many edges and for how long one draw holds. With one draw for all edges and the whole trajectory the
+As in the paper there is no prior network. The paper leaves open how the graph is *sampled*, and it matters: the sampled
+graph is the only randomness that a whole group shares. A graph is the arg max of logits plus Gumbel noise; `GraphNoise`
+decides over which edges and steps one draw is shared. With one draw for all edges and the whole trajectory, the
 marginal distribution of every edge at every step is still exactly the softmax, but the group commits to one graph and
 so to one of the expert's modes (docs/paper.md).
 """
@@ -14,7 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from ssmail.models.edge_layers import between_different
+from ssmail.models.fast_messages import between_different
 from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
@@ -32,22 +32,25 @@ class GraphEncoder(nn.Module):
         self.head = nn.Linear(hidden, edge_types)
 
     def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
-        """x (B, T, N, D) -> logits (B, T, N, N, K) and the memory after the last step; step t reads x[:, : t + 1]
-        only.
+        """Map x (B, T, N, D) to logits (B, T, N, N, K) and the memory after the last step.
+
+        The logits of step t depend on x[:, : t + 1] only.
         """
         b, t, n, _ = x.shape
-        edges = self.edges_in(x)
+        edges = self.edges_in(x)  # (B, T, N, N, H), sender first
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
-        embedded, memory = remember(self.lstm, off_diagonal(edges).transpose(0, 1).flatten(1, 2), memory)
+        sequences = off_diagonal(edges).transpose(0, 1).flatten(1, 2)  # (T, B * N * (N - 1), H)
+        embedded, memory = remember(self.lstm, sequences, memory)
         logits = self.head(embedded).view(t, b, n * (n - 1), self.head.out_features).transpose(0, 1)
         return on_diagonal(logits, n), memory
 
 
 def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
-    """A one-layer LSTM over (T, edges, D) -> (T, edges, H) and its memory. Steps come first, as the LSTM works, or it
-    would copy. A single step, as in a rollout, takes the cell itself, which costs half as much; without edges there is
-    nothing to do.
+    """Run a one-layer LSTM over sequences (T, edges, D); return its outputs (T, edges, H) and its memory.
+
+    Steps come first because torch's LSTM would copy otherwise. A single step, as in a rollout, calls the cell, which
+    costs half as much.
     """
     steps, edges, _ = sequences.shape
     if memory is None:
@@ -63,13 +66,13 @@ def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[T
 
 
 def off_diagonal(pairs: Tensor) -> Tensor:
-    """(B, T, N, N, H) -> (B, T, N * (N - 1), H): the edges between different agents, row by row."""
+    """Select the edges between different agents, row by row: (B, T, N, N, H) -> (B, T, N * (N - 1), H)."""
     b, t, n, _, h = pairs.shape
     return between_different(pairs.flatten(0, 1)).reshape(b, t, n * (n - 1), h)
 
 
 def on_diagonal(edges: Tensor, agents: int) -> Tensor:
-    """Inverse of `off_diagonal`, with zeros on the diagonal."""
+    """Invert `off_diagonal`, with zeros on the diagonal."""
     b, t, _, h = edges.shape
     n = agents
     rows = nn.functional.pad(edges.view(b, t, n - 1, n, h), (0, 0, 0, 1)).view(b, t, (n - 1) * (n + 1), h)
@@ -78,17 +81,17 @@ def on_diagonal(edges: Tensor, agents: int) -> Tensor:
 
 @dataclass(frozen=True)
 class GraphNoise:
-    """How the Gumbel noise of a graph is shared.
+    """Which edges and steps share a draw of Gumbel noise.
 
-    shared: "shared" gives all edges of a graph one draw, "edge" gives each its own.
-    resample: "trajectory" keeps the draw for a whole trajectory, "step" renews it at every step.
+    shared: with "shared" all edges of a graph share one draw, with "edge" each has its own.
+    resample: with "trajectory" a draw holds for the whole trajectory, with "step" it is renewed at every step.
     """
 
     shared: Literal["shared", "edge"]
     resample: Literal["trajectory", "step"]
 
     def draw(self, batch: int, steps: int, agents: int, edge_types: int, generator: torch.Generator) -> Tensor:
-        """Gumbel noise that broadcasts to (B, T, N, N, K): axes over which it is shared have length 1."""
+        """Draw Gumbel noise that broadcasts to (B, T, N, N, K): axes over which it is shared have length 1."""
         n = 1 if self.shared == "shared" else agents
         t = 1 if self.resample == "trajectory" else steps
         uniform = torch.rand(batch, t, n, n, edge_types, generator=generator)
@@ -96,8 +99,9 @@ class GraphNoise:
 
 
 def sample_graph(logits: Tensor, noise: Tensor, temperature: float) -> Tensor:
-    """One-hot edge types (..., K) = arg max(logits + Gumbel noise), with the gradient of the softmax at `temperature`
-    (straight-through).
+    """Sample one-hot edge types (..., K) as arg max(logits + Gumbel noise).
+
+    The gradient is that of the softmax at `temperature` (straight-through Gumbel-softmax).
     """
     soft = few_way_softmax((logits + noise) / temperature)
     chosen = soft.detach().argmax(dim=-1, keepdim=True)
@@ -106,14 +110,12 @@ def sample_graph(logits: Tensor, noise: Tensor, temperature: float) -> Tensor:
 
 
 def few_way_softmax(x: Tensor) -> Tensor:
-    """The softmax of the last axis (..., K). For the two or three edge types of a graph, torch's own takes several
-    times as long on a processor.
-    """
+    """Softmax over the last axis (..., K). For two or three edge types, torch's takes several times as long."""
     weights = (x - x.detach().amax(dim=-1, keepdim=True)).exp()
     return weights / weights.sum(dim=-1, keepdim=True)
 
 
 def graph_entropy(logits: Tensor) -> Tensor:
-    """Entropy in nats of the edge-type distribution, averaged over everything; 0 .. log K."""
-    log_p = torch.log_softmax(logits.movedim(-1, 0).contiguous(), dim=0)  # along the last axis it is slow for small K
+    """Return the mean entropy of the edge-type distributions in nats, between 0 and log K."""
+    log_p = torch.log_softmax(logits.movedim(-1, 0).contiguous(), dim=0)  # the last axis is slow for small K
     return -(log_p.exp() * log_p).sum(dim=0).mean()

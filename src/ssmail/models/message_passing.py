@@ -1,17 +1,37 @@
 """Message passing on the complete directed graph of N agents (Eq. 4; Kipf et al. 2018), batched over any leading axes.
 
-The first layer of an edge function reads [x_i, x_j]; because it is linear it is applied per node, W [x_i, x_j] = W_s
-x_i + W_r x_j, and broadcast to all pairs. That equals gathering both ends of each edge, without the gather. Axis -3 of
-a pair tensor is the sender i, axis -2 the receiver j. Sums over senders are divided by N - 1, so that one set of
-weights suits any number of agents.
-"""
+An edge function f_e reads both ends of an edge, and agent j receives the mean of f_e([x_i, x_j]) over its senders
+i != j. Dividing by N - 1 makes one set of weights suit any number of agents.
 
-from typing import Any
+Each network has two forms, with the same weights and equal outputs up to rounding. The readable one is the equation as
+it stands: gather x_i and x_j, concatenate, apply the layers, average over senders. The fast one is what training uses:
+the first layer is linear, so it is applied per agent, W [x_i, x_j] = W_s x_i + W_r x_j, and the rest never stores all
+edges at once (fast_messages.py). FAST is the one switch between them, for nri and dnri too.
+
+Axis -3 of a tensor of pairs is the sender i, axis -2 the receiver j. Gathered edges are (..., N, N - 1, H): receivers,
+then their senders.
+"""
 
 import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import ModelSpec
+from ssmail.models.fast_messages import sum_over_senders
+
+FAST = True  # False computes every network in its readable form
+
+
+def edge_ends(agents: int) -> tuple[Tensor, Tensor]:
+    """Return the senders and the receivers (N, N - 1) of all edges: row j holds the edges that end in agent j."""
+    receivers = torch.arange(agents).unsqueeze(-1).expand(agents, agents - 1)
+    senders = torch.arange(agents - 1).expand(agents, agents - 1)
+    return senders + (senders >= receivers), receivers  # no edge from j to itself
+
+
+def both_ends(x: Tensor) -> Tensor:
+    """Gather [x_i, x_j] of every edge: x (..., N, D) -> (..., N, N - 1, 2 * D)."""
+    senders, receivers = edge_ends(x.shape[-2])
+    return torch.cat([x[..., senders, :], x[..., receivers, :]], dim=-1)
 
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
@@ -19,72 +39,33 @@ def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, outputs))
 
 
-def others(agents: int, like: Tensor) -> Tensor:
-    """(N, N, 1) weights of the mean over senders: 1 / (N - 1) off the diagonal, 0 on it."""
+def sender_weights(agents: int, like: Tensor) -> Tensor:
+    """Return the weights (N, N, 1) of the mean over senders: 1 / (N - 1) off the diagonal, 0 on it."""
     self_edges = torch.eye(agents, dtype=like.dtype, device=like.device).unsqueeze(-1)
     return torch.sub(1, self_edges) / max(agents - 1, 1)
 
 
 def mean_over_senders(pairs: Tensor) -> Tensor:
-    """(..., N, N, H) -> (..., N, H): the mean over i != j; zeros for a single agent."""
-    mean: Tensor = (pairs * others(pairs.shape[-2], pairs)).sum(dim=-3)
+    """Average over i != j: (..., N, N, H) -> (..., N, H); zeros for a single agent."""
+    mean: Tensor = (pairs * sender_weights(pairs.shape[-2], pairs)).sum(dim=-3)
     return mean
 
 
-class SumOverSenders(torch.autograd.Function):
-    """sum_i w_ijk relu(s_ik + r_jk), without the tensor of all pairs: sender by sender, forwards and backwards.
-
-    s and r (..., N, K, H), w (..., N, N, K) -> (..., N, K, H). What is computed for a sender stays in the processor's
-    cache, and nothing of it is kept for the gradient. Differentiable twice.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, s: Tensor, r: Tensor, w: Tensor) -> Tensor:
-        """See the class."""
-        ctx.save_for_backward(s, r, w)
-        total = torch.zeros_like(r)
-        for i in range(s.shape[-3]):
-            total.addcmul_(torch.relu_(s[..., i : i + 1, :, :] + r), w[..., i, :, :].unsqueeze(-1))
-        return total
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-        """The gradients of s, r and (where it is wanted) w."""
-        s, r, w = ctx.saved_tensors
-        of_s, of_r, of_w = [], torch.zeros_like(r), []
-        for i in range(s.shape[-3]):
-            pairs = torch.relu_(s[..., i : i + 1, :, :] + r)
-            if ctx.needs_input_grad[2]:
-                of_w.append((pairs * gradient).sum(dim=-1))
-            weighted = gradient * w[..., i, :, :].unsqueeze(-1)
-            through = torch.ops.aten.threshold_backward(weighted, pairs, 0)
-            of_r += through
-            of_s.append(through.sum(dim=-3))
-        return torch.stack(of_s, dim=-3), of_r, torch.stack(of_w, dim=-3) if of_w else None
-
-
-DENSE_UP_TO = 8  # agents: up to so many, all pairs at once are faster than sender by sender
-
-
-def sum_over_senders(s: Tensor, r: Tensor, w: Tensor) -> Tensor:
-    """sum_i w_ijk relu(s_ik + r_jk), in the form that is faster for this number of agents; see SumOverSenders."""
-    if s.shape[-3] > DENSE_UP_TO:
-        total: Tensor = SumOverSenders.apply(s, r, w)  # type: ignore[no-untyped-call]  # torch's
-        return total
-    pairs = torch.relu_(s.unsqueeze(-3) + r.unsqueeze(-4))
-    return (pairs * w.unsqueeze(-1)).sum(dim=-4)
-
-
 class PairLayer(nn.Module):
-    """The first layer of an edge function f_e([x_i, x_j]): x (..., N, D) -> (..., N, N, H)."""
+    """The first layer of an edge function, W [x_i, x_j] + b, where W = [W_s, W_r] acts on sender and receiver."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
         self.sender = nn.Linear(inputs, outputs, bias=False)
         self.receiver = nn.Linear(inputs, outputs)
 
+    def gathered(self, x: Tensor) -> Tensor:
+        """Apply the layer to every edge in readable form: x (..., N, D) -> (..., N, N - 1, H)."""
+        weight = torch.cat([self.sender.weight, self.receiver.weight], dim=1)
+        return nn.functional.linear(both_ends(x), weight, self.receiver.bias)
+
     def forward(self, x: Tensor) -> Tensor:
-        """Pre-activations for every ordered pair, the diagonal included."""
+        """Apply the layer per agent and broadcast: x (..., N, D) -> (..., N, N, H), the diagonal included."""
         pairs: Tensor = self.sender(x).unsqueeze(-2) + self.receiver(x).unsqueeze(-3)
         return pairs
 
@@ -98,24 +79,29 @@ class EdgeFunction(nn.Module):
         self.second = nn.Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Edge embeddings h_(i,j): x (..., N, D) -> (..., N, N, H)."""
+        """Return the edge embeddings h_(i,j) of all pairs: x (..., N, D) -> (..., N, N, H)."""
         out: Tensor = self.second(torch.relu(self.first(x)))
         return out
 
     def messages(self, x: Tensor) -> Tensor:
-        """Their mean over senders: x (..., N, D) -> (..., N, H). The second layer is linear, so it is applied after
-        the mean.
-        """
+        """Return the mean of the embeddings over senders: x (..., N, D) -> (..., N, H)."""
+        agents = x.shape[-2]
+        if not FAST:
+            if agents == 1:  # without senders, the bias is what remains
+                return self.second.bias.expand(*x.shape[:-1], -1)
+            embedded: Tensor = self.second(torch.relu(self.first.gathered(x)))  # (..., N, N - 1, H)
+            return embedded.mean(dim=-2)
+        # The second layer is linear too, so it follows the mean.
         s, r = self.first.sender(x).unsqueeze(-2), self.first.receiver(x).unsqueeze(-2)
-        out: Tensor = self.second(sum_over_senders(s, r, others(x.shape[-2], x)).squeeze(-2))
+        out: Tensor = self.second(sum_over_senders(s, r, sender_weights(agents, x)).squeeze(-2))
         return out
 
 
 class TypedMessages(nn.Module):
-    """Messages sum_k z_ijk f_e^k([x_i, x_j]), averaged over senders (section 3.2.2).
+    """The messages of G-SAC (section 3.2.2): sum_k z_ijk f_e^k([x_i, x_j]), averaged over the senders i.
 
-    The second layer of every f_e^k is linear, so it is applied after the mean: N products instead of N * N.
-    With `first_type_is_none` the first type has no function: no message flows along its edges.
+    z is the sampled graph, and every edge type k has its own function of two layers. With `first_type_is_none` the
+    first type has no function: no message flows along its edges.
     """
 
     def __init__(self, inputs: int, spec: ModelSpec) -> None:
@@ -130,9 +116,23 @@ class TypedMessages(nn.Module):
             self.type_bias.weight.mul_(spec.graph_gain)
 
     def forward(self, x: Tensor, graph: Tensor) -> Tensor:
-        """x (..., N, D) and graph (..., N, N, K) -> (..., N, H)."""
-        weights = graph[..., self.skipped :] * others(x.shape[-2], x)
+        """Map x (..., N, D) and graph (..., N, N, K) to the mean messages (..., N, H)."""
+        return self._per_agent(x, graph) if FAST else self._per_edge(x, graph)
+
+    def _per_edge(self, x: Tensor, graph: Tensor) -> Tensor:
+        """The readable form."""
+        senders, receivers = edge_ends(x.shape[-2])
+        z = graph[..., senders, receivers, self.skipped :]  # (..., N, N - 1, K)
+        hidden = torch.relu(self.first.gathered(x))
+        hidden = hidden.view(*hidden.shape[:-1], self.types, len(self.second.weight))  # (..., N, N - 1, K, H)
+        weight = self.second.weight.view(-1, *hidden.shape[-2:])  # (H, K, H)
+        f = torch.einsum("...kh,okh->...ko", hidden, weight) + self.type_bias.weight.t()  # f_e^k([x_i, x_j])
+        return (z.unsqueeze(-1) * f).sum(dim=(-3, -2)) / max(x.shape[-2] - 1, 1)
+
+    def _per_agent(self, x: Tensor, graph: Tensor) -> Tensor:
+        """The fast form: the second layers are linear, so they follow the mean, N products instead of N * N."""
+        weights = graph[..., self.skipped :] * sender_weights(x.shape[-2], x)
         s, r = (layer(x).unflatten(-1, (self.types, -1)) for layer in (self.first.sender, self.first.receiver))
-        received = sum_over_senders(s, r, weights).flatten(-2)
+        received = sum_over_senders(s, r, weights).flatten(-2)  # (..., N, K * H)
         messages: Tensor = self.second(received) + self.type_bias(weights.sum(dim=-3))
         return messages

@@ -12,16 +12,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ssmail.config.experiments import figure_requirements
+from ssmail.data.trajectories import Floats
 from ssmail.paper.claims import Sample
 from ssmail.plots import NoRuns
-from ssmail.plots.ablation_selection import select_ablation
 from ssmail.plots.metric_units import is_error
-from ssmail.plots.selection import Group, Selection, select
+from ssmail.plots.run_groups import Group, Selection
+from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
-Floats = npt.NDArray[np.float64]
 Array = npt.NDArray[Any]
 
 WORST, LEAST = np.inf, -np.inf  # what a diverged run counts as
@@ -46,9 +45,8 @@ class Runs:
 
         Raises InputError for an unknown figure and for runs on different data.
         """
-        chosen = select if figure_requirements(figure).ablation is None else select_ablation
         try:
-            return cls(store, chosen(store, figure, profile=profile))
+            return cls(store, select(store, figure, profile=profile))
         except NoRuns:
             return cls(store)
 
@@ -116,7 +114,7 @@ class Runs:
 def _computed(
     read: Callable[[RunRow], list[Array]], number: Callable[..., float], diverged: float
 ) -> Callable[[RunRow], float]:
-    """The function that computes a finished run's number from what `read` finds: see the top of this module."""
+    """Return the function that computes a finished run's number from the values that `read` returns."""
 
     def value(run: RunRow) -> float:
         values = read(run)

@@ -5,9 +5,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ssmail.evaluation.statistics import LARGEST, permutation_test
+from ssmail.evaluation.hypothesis_tests import MAX_SPLITS, permutation_test
 from ssmail.plots import style
 from ssmail.plots.curves import CEILING, Band, Curve
+
+
+def of_errors(bands: Sequence[Band]) -> tuple[str, ...]:
+    """All notes on errors over epochs."""
+    return (*high(bands), *cut(bands), *comparisons(bands))
 
 
 def cut(bands: Sequence[Band]) -> tuple[str, ...]:
@@ -36,7 +41,7 @@ def comparisons(bands: Sequence[Band]) -> tuple[str, ...]:
     notes = []
     for other in bands[1:]:
         a, b = (shown.last for shown in (bands[0], other))
-        unfinished, many = np.isnan([*a, *b]).any(), math.comb(len(a) + len(b), len(a)) > LARGEST
+        unfinished, many = np.isnan([*a, *b]).any(), math.comb(len(a) + len(b), len(a)) > MAX_SPLITS
         if unfinished or many:
             continue  # there is no last epoch, or no enumerating all splits
         found = permutation_test(a, b, on="ranks")

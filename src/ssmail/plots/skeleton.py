@@ -20,9 +20,8 @@ from matplotlib.patches import Circle
 from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
-from ssmail.data import expert_file
-from ssmail.data.mocap.dataset import SPLITS
-from ssmail.data.trajectories import ExpertSet, Trajectories
+from ssmail.data import expert_sets
+from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError, unknown_name
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
@@ -117,13 +116,13 @@ def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
 
 def _recorded(path: Path) -> ExpertSet:
     """The set in the file. A set of another environment is refused with what makes a fitting one, because what
-    `expert_file.load` says of it is how to train on it.
+    `expert_sets.load` says of it is how to train on it.
     """
     try:
-        return expert_file.load(path, "mocap")
+        return expert_sets.load(path, "mocap")
     except InputError as refused:
         try:
-            other = expert_file.load(path).environment
+            other = expert_sets.load(path).environment
         except InputError:
             raise refused from None
     raise InputError(

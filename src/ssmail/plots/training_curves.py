@@ -25,7 +25,7 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, silent
 from ssmail.plots.metric_units import label, last_part
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.selection import Group, Selection, by_spec, newest_of_each_seed, on_one_data_set
+from ssmail.plots.run_groups import Group, by_spec, check_one_data_set, newest_of_each_seed
 from ssmail.store import RunRow, Store
 
 NAME = "training"
@@ -102,7 +102,7 @@ def collect(
             raise _unknown_metric(store, runs, metric)
         groups, left_out = _groups(runs, values, group_by)
         for group in groups:
-            on_one_data_set(NAME, Selection((group,), ()))
+            check_one_data_set(NAME, group.runs)
         panels.append(Panel(metric, tuple(band(group, metric, values, statistic, reached) for group in groups)))
         drawn |= {run.id: run for group in groups for run in group.runs}
         notes += left_out

@@ -58,25 +58,15 @@ class Store:
         environment: str | None = None,
         profile: str | None = None,
         state: RunState | str | None = None,
-        figure: str | None = None,
         ids: Sequence[str] | None = None,
     ) -> list[RunRow]:
         """The runs that meet every condition given, newest last.
 
-        `figure` keeps the runs of the environment and methods, or of the ablation's specs, that experiments.yaml lists
-        for that figure; `ids` are ids or their beginnings. Raises InputError for an unknown figure and for an unknown
-        or ambiguous id.
+        `ids` are ids or their beginnings. Raises InputError for an unknown or ambiguous id.
         """
         run = schema.run
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}
         conditions = [column == value for column, value in equal.items() if value is not None]
-        if figure is not None:
-            from ssmail.config.experiments import ablation_hashes, figure_requirements
-
-            needed = figure_requirements(figure)
-            conditions += [run.c.environment == needed.environment, run.c.method.in_(list(needed.methods))]
-            if needed.ablation is not None:
-                conditions.append(run.c.spec_hash.in_(ablation_hashes(needed.ablation, needed.environment)))
         with reading(self._engine) as connection:
             if ids is not None:
                 conditions.append(run.c.id.in_(queries.resolve(connection, ids)))

@@ -1,1 +1,1 @@
-"""Training: the learner, rollouts, curricula, replay, and the loop that yields metrics."""
+"""Training: the learners of all methods, rollouts, curricula, evaluators, and the loop."""

@@ -1,4 +1,4 @@
-"""G-SAC in training (section 3.2.2): the policy, twin critics, their slow copies, the temperature, and one update."""
+"""G-SAC (section 3.2.2): a graph policy, twin critics with target networks, a temperature, and their joint update."""
 
 from collections.abc import Callable, Iterable
 from copy import deepcopy
@@ -15,29 +15,32 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import graph_entropy
 from ssmail.models.policy import GraphPolicy
-from ssmail.training.replay import Batch
+from ssmail.training.batches import Batch
+from ssmail.training.optimization import clipped_step
 from ssmail.training.seeding import Generators
-from ssmail.training.updates import clipped_step
 
 Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions as read (B, T, N, A) -> rewards (B, T, N)
 
 
 @dataclass(frozen=True)
 class Transitions:
-    """Some time steps of some trajectories: what actor and critics learn from. C steps are chosen of each."""
+    """A training batch of actor and critics: C time steps from each of B trajectories."""
 
     x: Tensor  # (B, C, N, F)
-    actions: Tensor  # (B, C, N, A), as they are read
+    actions: Tensor  # (B, C, N, A), as the networks read them
     graph: Tensor  # (B, C, N, N, K), with gradient
     velocity: Tensor  # (B, C, N, A) before the action
     next_x: Tensor
-    next_graph: Tensor  # without gradient
+    next_graph: Tensor  # detached
     next_velocity: Tensor
     edge_entropy: Tensor  # nats, mean over all steps
 
 
 class ActorCritic:
-    """`gradient_clip` bounds the norm of each network's gradient; `rates` of the optimisers are the caller's to set."""
+    """Policy, critics and temperature with their optimizers, whose learning rates the caller sets.
+
+    `gradient_clip` bounds the norm of each network's gradient.
+    """
 
     def __init__(
         self,
@@ -68,19 +71,20 @@ class ActorCritic:
 
     @property
     def temperature(self) -> Tensor:
-        """The entropy's weight, as a tensor without gradient."""
+        """The entropy's weight, detached."""
         fixed = torch.tensor(self.spec.temperature, device=self.device)
         return self.log_temperature.detach().exp() if self.spec.automatic_temperature else fixed
 
     def update(
         self, batch: Batch, chosen: Callable[[int], Tensor], reward: Reward, *, actor_learns: bool = True
     ) -> dict[str, Tensor]:
-        """One SAC step on the transitions of whole trajectories; `chosen` draws the time steps to use of T.
+        """Take one SAC step on whole trajectories; `chosen` draws which of their T time steps to use.
 
-        Rewards are computed anew from the stored states and actions. Without `actor_learns` the policy and its
-        temperature stay, and the critics learn what it is worth.
+        Rewards are recomputed from the stored states and actions. Without `actor_learns` the policy and its temperature
+        stay fixed while the critics learn the policy's value. Returns losses and means as scalar tensors.
         """
         at = self._transitions(batch, chosen)
+        # Critics: one regression step to r + gamma * (min target Q - temperature * log pi) of the next state.
         with torch.no_grad():
             rewards = reward(at.x, at.actions)
             next_action, next_log_prob = self.policy.actor.sample_with_log_prob(
@@ -91,8 +95,10 @@ class ActorCritic:
             target = critic_target(rewards, next_q, next_log_prob, self.temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
         self._step("critic", value_loss, self.critic.parameters())
+        # Actor and temperature.
         policy_loss, log_prob = self._update_actor(at, actor_learns)
-        self._follow()
+        # Target networks.
+        self._update_target()
         return {
             "critic/loss": value_loss,
             "actor/loss": policy_loss,
@@ -103,13 +109,13 @@ class ActorCritic:
         }
 
     def _transitions(self, batch: Batch, chosen: Callable[[int], Tensor]) -> Transitions:
+        """Infer the graphs of whole trajectories, then pick time steps."""
         a = batch.actions.shape[-1]
         states = batch.states[:, :-1]
         next_states = self.integrator.step(states, batch.actions)
         x = self.features(states, batch.states[:, 0])
         next_x = self.features(next_states, batch.states[:, 0], first_step=1)
-        # The graph after step t is inferred from the states that the policy read, so one pass of the encoder serves
-        # both ends of a transition.
+        # One pass of the encoder over all T + 1 states gives the graphs at both ends of every transition.
         history = torch.cat([x, next_x[:, -1:]], dim=1)
         graphs, edge_entropy = self._graphs(history)
         at = chosen(x.shape[1])
@@ -125,10 +131,10 @@ class ActorCritic:
         )
 
     def _graphs(self, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Sampled graphs (B, T, N, N, K) of features (B, T, N, F), and the entropy of their distribution.
+        """Sample graphs (B, T, N, N, K) from features (B, T, N, F), and return them with their entropy in nats.
 
-        With sac.encoder_steps the gradient goes through that many consecutive steps alone, from a random one on:
-        backpropagation through time, truncated. The values are the same.
+        Truncated backpropagation through time: with sac.encoder_steps, the gradient flows through a random window of
+        that many consecutive steps only. The values do not depend on the window.
         """
         b, t, n, _ = history.shape
         noise = (
@@ -136,6 +142,7 @@ class ActorCritic:
         )
         learned = min(self.spec.encoder_steps or t, t)
         start = int(torch.randint(t - learned + 1, (), generator=self.generators["data"])) if learned < t else 0
+        # Read the steps before, in and after the window in turn; only the window records a gradient.
         graphs, logits, memory = [], [], None
         for first, last in ((0, start), (start, start + learned), (start + learned, t)):
             if first < last:
@@ -146,9 +153,10 @@ class ActorCritic:
         return torch.cat(graphs, dim=1), graph_entropy(torch.cat(logits, dim=1))
 
     def _update_actor(self, at: Transitions, learns: bool) -> tuple[Tensor, Tensor]:
+        """Take one step of actor and graph encoder, then one of the temperature; return the loss and log pi."""
         action, log_prob = self.policy.actor.sample_with_log_prob(at.x, at.graph, at.velocity, self._noise(at.actions))
         action = self.features.of_actions(action)
-        self.critic.requires_grad_(False)
+        self.critic.requires_grad_(False)  # the actor's gradient flows through the critics but not into them
         loss = actor_loss(self.critic(at.x, action, at.graph.detach()), log_prob, self.temperature)
         self.critic.requires_grad_(True)
         if learns:
@@ -167,14 +175,14 @@ class ActorCritic:
         clipped_step(self.optimizers[name], loss, parameters, self.gradient_clip)
 
     @torch.no_grad()
-    def _follow(self) -> None:
-        """Move the target critics towards the critics (Polyak averaging)."""
-        slow: list[Tensor] = list(self.target_critic.parameters())
-        fast: list[Tensor] = list(self.critic.parameters())
-        torch._foreach_lerp_(slow, fast, self.spec.polyak)
+    def _update_target(self) -> None:
+        """Move the target networks towards the critics by Polyak averaging: target += polyak * (critic - target)."""
+        target: list[Tensor] = list(self.target_critic.parameters())
+        source: list[Tensor] = list(self.critic.parameters())
+        torch._foreach_lerp_(target, source, self.spec.polyak)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that an update changes."""
+        """Return everything that an update changes."""
         return {
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),

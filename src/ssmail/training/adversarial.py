@@ -1,11 +1,11 @@
-"""The adversarial learner (Alg. 1): a discriminator and a soft actor-critic that climbs its output.
+"""The adversarial learner (Alg. 1): a discriminator, and a soft actor-critic that maximizes the reward made of it.
 
-ssail, gail and wail differ in one row of GAMES, and in whether tau_alpha joins the batches (self-supervision).
+ssail, gail and wail differ in one row of OBJECTIVES, and in whether tau_alpha joins the batches (self-supervision,
+section 3.1.2).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,98 +27,105 @@ from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alph
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
-from ssmail.models.standards import Reach
 from ssmail.training.actor_critic import ActorCritic
+from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
-from ssmail.training.learning import Setting
-from ssmail.training.learning_rates import DecayingRates
-from ssmail.training.policy_predictor import PolicyPredictor
-from ssmail.training.replay import Batch, Replay
-from ssmail.training.rollout import rollout
-from ssmail.training.updates import clipped_step, mean_of, with_noise
+from ssmail.training.learner import LearnerContext, Stateful
+from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
+from ssmail.training.rollout import PolicyPredictor, rollout
 
 
 @dataclass(frozen=True)
-class Game:
-    """What makes a method: the discriminator's loss of its outputs on tau_G and tau_E (and on tau_alpha, with its
-    labels), and the reward made of its output.
+class AdversarialObjective:
+    """The two functions that define a method.
+
+    loss: the discriminator's loss from its outputs on tau_G and tau_E (and, for ssail, on tau_alpha and its labels).
+    reward: the actor-critic's reward from the discriminator's output.
     """
 
     loss: Callable[..., tuple[Tensor, Terms]]
     reward: Callable[[Tensor], Tensor]
 
 
-GAMES = {
-    "ssail": Game(ssail_loss, ssail_reward),
-    "gail": Game(gail_loss, gail_reward),
-    "wail": Game(wail_loss, wail_reward),
+OBJECTIVES = {
+    "ssail": AdversarialObjective(ssail_loss, ssail_reward),  # Eq. 3
+    "gail": AdversarialObjective(gail_loss, gail_reward),  # Eq. 1
+    "wail": AdversarialObjective(wail_loss, wail_reward),  # Eq. 2
 }
 
 
 class AdversarialLearner:
-    """Networks, optimisers, the replay of tau_G, and an epoch of training."""
+    """Alternates discriminator steps and soft actor-critic steps on trajectories from a replay buffer."""
 
-    def __init__(self, setting: Setting) -> None:
-        spec = setting.spec
+    def __init__(self, context: LearnerContext) -> None:
+        spec = context.spec
         model, sac = required(spec.model), required(spec.sac)
-        self.setting, self.game = setting, GAMES[spec.method]
+        self.context, self.objective = context, OBJECTIVES[spec.method]
         self.adversarial, self.training = required(spec.adversarial), required(spec.training)
         self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
         self.label = None
         if self.supervision:
             self.label = checked_label(self.supervision, load_label(self.supervision.label))
-        self.experts, self.generators, self.device = setting.experts, setting.generators, setting.device
+        self.experts, self.generators, self.device = context.experts, context.generators, context.device
         state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
         self.features = Features.of(model, self.experts.states)
         inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(inputs, action_size, model, Reach.of(model, self.features.standards)).to(self.device)
+            policy = GraphPolicy(inputs, action_size, model, ActionBounds.of(model, self.features.normalization)).to(
+                self.device
+            )
             critic = TwinCritic(inputs + action_size, model).to(self.device)
             self.discriminator = Discriminator(inputs + action_size, model.hidden).to(self.device)
         self.actor_critic = ActorCritic(
-            sac, policy, critic, self.features, setting.integrator, self.generators, self.training.gradient_clip
+            sac, policy, critic, self.features, context.integrator, self.generators, self.training.gradient_clip
         )
-        self.predictor = PolicyPredictor(policy, self.features, setting.integrator)
+        self.predictor = PolicyPredictor(policy, self.features, context.integrator)
         self.optimizer = torch.optim.Adam(
             self.discriminator.parameters(),
             lr=self.adversarial.learning_rate,
             betas=(self.adversarial.beta1, 0.999),
             fused=True,
         )
-        self.rates = DecayingRates(
+        self.schedule = LearningRateSchedule(
             self.training,
             {**self.actor_critic.optimizers, "discriminator": self.optimizer},
             {**self.actor_critic.final_rates, "discriminator": self.adversarial.learning_rate_final},
         )
-        self.replay = Replay(self.adversarial.replay)
+        self.replay = ReplayBuffer(self.adversarial.replay)
 
     def networks(self) -> list[nn.Module]:
-        """Policy, critics, discriminator."""
+        """Return policy, critics and discriminator."""
         return [self.actor_critic.policy, self.actor_critic.critic, self.discriminator]
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
-        """Roll out, then update."""
+        """Roll out once under the curriculum, then take training.updates updates (Alg. 1)."""
         frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
-        self.rates.set(epoch)
+        self.schedule.set(epoch)
+        # tau_G from the current policy, into the replay buffer.
         latest, interventions = self.generate(frequency)
         self.replay.add(latest)
+        # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
         actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
-        values = mean_of([self.update(latest, actor_learns=actor_learns) for _ in range(self.training.updates)])
+        values = mean_metrics([self.update(latest, actor_learns=actor_learns) for _ in range(self.training.updates)])
         return values | curriculum_metrics(frequency, [interventions])
 
     def generate(self, frequency: float) -> tuple[Batch, Tensor]:
-        """tau_G from random training starts under the curriculum, and the interventions (B, T)."""
-        count, steps = self.adversarial.rollouts, self.setting.steps
+        """Generate tau_G from random training starts, and return it with the interventions (B, T).
+
+        `frequency` is the curriculum's probability of an intervention per step (trajectory forcing, section 3.3).
+        """
+        count, steps = self.adversarial.rollouts, self.context.steps
         source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
         interventions = draw_interventions(count, steps, frequency, self.generators["curriculum"])
         expert = self.experts.states[source]
         made = rollout(
             self.actor_critic.policy,
             self.features,
-            self.setting.integrator,
+            self.context.integrator,
             expert[:, :1],
             steps,
             self.generators["policy"],
@@ -128,29 +135,33 @@ class AdversarialLearner:
         return Batch(made.states, made.actions, source), interventions
 
     def update(self, latest: Batch, *, actor_learns: bool = True) -> dict[str, float]:
-        """Discriminator steps, then one SAC step (two time scales); returns means of the losses."""
+        """Take adversarial.updates discriminator steps, then one SAC step (two time scales). Returns mean losses."""
         logs = [self._update_discriminator(latest) for _ in range(self.adversarial.updates)]
         values = self.actor_critic.update(self._actor_batch(), self._pick_steps, self.reward, actor_learns=actor_learns)
-        return mean_of(logs) | {name: float(value.detach()) for name, value in values.items()}
+        return mean_metrics(logs) | {name: float(value.detach()) for name, value in values.items()}
 
     def _update_discriminator(self, latest: Batch) -> dict[str, float]:
+        # tau_G: fresh rollouts, and a share of past ones from the replay buffer. tau_E: the expert's.
         b = self.training.batch
         past = round(b * self.adversarial.past_share)
         parts = [latest.draw(b - past, self.generators["data"])] if past < b else []
         if past:
             parts.append(self.replay.sample(past, self.generators["data"]))
         batches = [Batch.concatenate(parts), self.experts.draw(b, self.generators["data"])]
+        # tau_alpha and its labels (self-supervision).
         labels: tuple[Tensor, ...] = ()
         if self.supervision and self.label:
             mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
             batches.append(mixed)
             labels = (self.label(alpha),)
+        # One pass of D over all parts at the same random time steps; its outputs are then split again (Eq. 3).
         everything = Batch.concatenate(batches)
         chosen = self._pick_steps(everything.actions.shape[1])
         states, actions = everything.states[:, :-1], everything.actions[:, chosen]
-        x = self._blurred(self.features(states, states[:, 0])[:, chosen], states.shape[-1])
-        actions = self._blurred(self.features.of_actions(actions))
-        loss, terms = self.game.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
+        x = self._add_input_noise(self.features(states, states[:, 0])[:, chosen], states.shape[-1])
+        actions = self._add_input_noise(self.features.of_actions(actions))
+        loss, terms = self.objective.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
+        # wail bounds D's slope by a gradient penalty, or by clipping its weights.
         if self.wasserstein and self.wasserstein.constraint == "penalty":
             terms["penalty"] = self.wasserstein.penalty * self._penalty(x, actions)
             loss = loss + terms["penalty"]
@@ -160,7 +171,7 @@ class AdversarialLearner:
         return {f"discriminator/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
 
     def _penalty(self, x: Tensor, actions: Tensor) -> Tensor:
-        """The gradient penalty between the two halves of a batch: generated and expert."""
+        """Return the gradient penalty between the generated and the expert half of a batch."""
         (x_g, x_e), (a_g, a_e) = x.chunk(2), actions.chunk(2)
         weight = torch.rand(x_g.shape[:2], generator=self.generators["data"]).to(self.device)
         return gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
@@ -171,7 +182,11 @@ class AdversarialLearner:
             parameter.clamp_(-limit, limit)
 
     def _actor_batch(self) -> Batch:
-        """What the actor-critic learns from: tau_G, and with self-supervision tau_alpha in its share."""
+        """Draw the actor-critic's batch from the replay buffer.
+
+        With self-supervision, tau_alpha replaces the first self_supervision.actor_share of tau_G: the dynamics are
+        affine, so an off-policy critic can learn from the mix (section 3.1.2).
+        """
         generated = self.replay.sample(self.training.batch, self.generators["data"])
         if not self.supervision:
             return generated
@@ -180,15 +195,17 @@ class AdversarialLearner:
         return Batch.concatenate([mixed, generated[torch.arange(count, len(generated))]])
 
     def reward(self, x: Tensor, actions: Tensor) -> Tensor:
-        """(..., N) what the actor-critic is given for features x (..., N, F) and actions (..., N, A): the method's
-        reward with today's discriminator, scaled and limited.
+        """Return the rewards (..., N) of features x (..., N, F) and actions (..., N, A).
+
+        The method's reward with the current discriminator, scaled by adversarial.reward_scale and clipped to
+        adversarial.reward_limit.
         """
-        reward = self.adversarial.reward_scale * self.game.reward(self.discriminator(x, actions))
+        reward = self.adversarial.reward_scale * self.objective.reward(self.discriminator(x, actions))
         limit = self.adversarial.reward_limit
         return reward if limit is None else reward.clamp(-limit, limit)
 
     def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
-        """The expert trajectory that each generated one is mixed with."""
+        """Return the expert trajectory with which to mix each generated one."""
         if pairing == "start":
             return self.experts[generated.source]
         if pairing == "nearest":
@@ -197,34 +214,27 @@ class AdversarialLearner:
         return drawn[assignment(generated.states, drawn.states)]
 
     def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
-        """tau_alpha and its alphas for a batch of tau_G."""
+        """Mix a batch of tau_G with its expert partners: tau_alpha and alpha (B,), section 3.1."""
         alpha = sample_alpha(len(generated), supervision.alpha_pieces, self.generators["alpha"]).to(self.device)
         expert = self._pair(generated, pairing)
         states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
         return Batch(states, actions, generated.source), alpha
 
     def _pick_steps(self, steps: int) -> Tensor:
-        """The time steps that an update uses, in random order: all of them, or adversarial.time_steps of them."""
+        """Draw the time steps of an update in random order: all, or adversarial.time_steps of them."""
         order = torch.randperm(steps, generator=self.generators["data"])
         return order[: self.adversarial.time_steps].to(self.device)
 
-    def _blurred(self, inputs: Tensor, features: int | None = None) -> Tensor:
-        """`inputs` with Gaussian noise on the first `features` of them (all by default), so that D judges the track,
-        not the jitter.
-        """
-        noisy = with_noise(inputs[..., :features], self.adversarial.input_noise, self.generators["data"])
+    def _add_input_noise(self, inputs: Tensor, features: int | None = None) -> Tensor:
+        """Add Gaussian noise to the first `features` inputs (all by default), so that D ignores jitter."""
+        noisy = add_noise(inputs[..., :features], self.adversarial.input_noise, self.generators["data"])
         return noisy if features is None else torch.cat([noisy, inputs[..., features:]], dim=-1)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that an epoch changes, but for the generators."""
+    def parts(self) -> Mapping[str, Stateful]:
+        """Return all networks, optimizers and the replay buffer."""
         return {
-            "actor_critic": self.actor_critic.state_dict(),
-            "discriminator": self.discriminator.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "replay": self.replay.state_dict(),
+            "actor_critic": self.actor_critic,
+            "discriminator": self.discriminator,
+            "optimizer": self.optimizer,
+            "replay": self.replay,
         }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
-        for name in ("actor_critic", "discriminator", "optimizer", "replay"):
-            getattr(self, name).load_state_dict(state[name])

@@ -1,12 +1,12 @@
 """Checkpoints on disk: written whole or not at all, and read without running any code they hold."""
 
-import os
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
 
 
@@ -16,15 +16,9 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     A process that dies at any moment leaves the old file or the new one, and so does a power cut. Raises InputError
     when the file cannot be written.
     """
-    partial = path.with_name(path.name + ".partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
+        with atomic_write(path) as partial, partial.open("wb") as file:
             torch.save(state, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-        _sync_folder(path.parent)
     except OSError as error:
         raise InputError(
             f"cannot write the checkpoint {path} ({error.strerror}); free or choose another place"
@@ -45,14 +39,3 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if not isinstance(state, dict):
         raise InputError(f"{path} is not a checkpoint of ssmail; start afresh with --resume never")
     return state
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename in `folder` outlast a power cut."""
-    if os.name == "nt":  # Windows cannot open a folder, and needs no such step
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

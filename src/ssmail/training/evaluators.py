@@ -1,273 +1,249 @@
-"""What is measured of a predictor after every epoch and at the end, environment by environment."""
+"""Evaluation of a predictor after every epoch and at the end of training: one evaluator per environment."""
 
 import math
-from collections.abc import Callable
-from typing import Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ssmail.config.sections import required
-from ssmail.config.spec import RunSpec
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
-from ssmail.evaluation.protocol import forecast_metrics, full_metrics, letter_metrics, one_step_mse, quick_metrics
-from ssmail.training.experts import as_doubles, scaled_batch
-from ssmail.training.learning import Predictor, Setting
-from ssmail.training.references import ConstantVelocity, CopyLast
+from ssmail.evaluation.metrics import (
+    forecast_metrics,
+    lane_metrics,
+    lane_test_metrics,
+    letter_metrics,
+    one_step_mse,
+)
+from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
+from ssmail.training.batches import Batch, to_numpy
+from ssmail.training.learner import LearnerContext, Predictor
 
 Arrays = dict[str, np.ndarray]
 
 
-class Evaluator(Protocol):
-    """Measures predictors on the splits of an expert set."""
+class Evaluator(ABC):
+    """Measures predictors on the splits of an expert set. It draws from the evaluation generator only."""
 
+    def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
+        self.context, self.data, self.spec = context, data, context.spec.evaluation
+        self.scaling, self.device, self.steps = data.scaling, context.device, context.steps
+        self.generator = context.generators["evaluation"]
+        self.validation_states = self.states(data.validation)
+        self.constant_velocity = ConstantVelocity(context.integrator)
+
+    @abstractmethod
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """The metrics of every epoch, of validation and of some training trajectories."""
-        ...
+        """Return the metrics of an epoch, on the validation split and on some training trajectories."""
 
-    def rank(self, values: dict[str, float]) -> tuple[bool, float]:
-        """How good the epoch with these metrics is: the smallest is the best."""
-        ...
+    @abstractmethod
+    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
+        """Return (flawed, error) of the epoch with these metrics. The epoch with the smallest pair is the best."""
 
-    def final(self, best: Predictor, last: Predictor) -> tuple[dict[str, float], Arrays]:
-        """The metrics on the test split, and the arrays to draw."""
-        ...
+    @abstractmethod
+    def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
+        """Return the metrics on the test split, and the arrays to draw.
 
-    def beginning(self, untrained: Predictor) -> Arrays:
-        """The arrays to draw of a predictor before its first epoch; may be none."""
-        ...
-
-
-def make_evaluator(spec: RunSpec, data: ExpertSet, setting: Setting) -> Evaluator:
-    """That of the spec's environment."""
-    return EVALUATORS[spec.environment](spec, data, setting)
-
-
-class _Evaluator:
-    """What the evaluators of all environments share: the splits as tensors, and draws from their own generator."""
-
-    def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
-        self.spec, self.data, self.setting = spec, data, setting
-        self.scaling, self.device = data.scaling, setting.device
-        self.generator = setting.generators["evaluation"]
-        self.validation_states = scaled_batch(data.validation, self.scaling, self.device).states
-        self.reference = ConstantVelocity(setting.integrator)
-
-    def beginning(self, untrained: Predictor) -> Arrays:
-        """None."""
-        return {}
-
-    def some_training_trajectories(self) -> Tensor:
-        """Indices of spec.evaluation.train_rollouts training trajectories, drawn anew in every epoch."""
-        count = min(self.spec.evaluation.train_rollouts, len(self.data.train))
-        return torch.randperm(len(self.data.train), generator=self.generator)[:count]
+        best: the model with the best validation error. last: the model after the last epoch. untrained: the model
+        before the first one.
+        """
 
     def states(self, trajectories: Trajectories) -> Tensor:
-        """Scaled states (B, T, N, D)."""
-        return scaled_batch(trajectories, self.scaling, self.device).states
-
-    def one_step(self, predictor: Predictor, states: Tensor) -> float:
-        """See evaluation.protocol.one_step_mse."""
-        predicted = predictor.one_step(states, self.generator)
-        return one_step_mse(predicted.double().cpu().numpy(), states[:, 1:].double().cpu().numpy())
+        """Return scaled states (B, T, N, D)."""
+        return Batch.from_trajectories(trajectories, self.scaling, self.device).states
 
     def raw_positions(self, states: Tensor) -> Floats:
-        """Scaled states (..., 2P) -> raw positions (..., P)."""
-        raw: Floats = self.scaling.unscale_positions(as_doubles(states[..., : states.shape[-1] // 2]))
+        """Convert scaled states (..., 2P) to raw positions (..., P)."""
+        raw: Floats = self.scaling.unscale_positions(to_numpy(states[..., : states.shape[-1] // 2]))
         return raw
 
+    def draw_training(self) -> Tensor:
+        """Draw the indices of evaluation.train_rollouts training trajectories, anew in every epoch."""
+        count = min(self.spec.train_rollouts, len(self.data.train))
+        return torch.randperm(len(self.data.train), generator=self.generator)[:count]
 
-class LaneEvaluator(_Evaluator):
-    """Y-Junction: free-running from the first state, judged by the distance to the nearer lane."""
+    def sample(
+        self, predictor: Predictor, states: Tensor, deterministic: bool = False, samples: int | None = None
+    ) -> Tensor:
+        """Roll out from the first of the scaled states (B, T, N, D): (S, B, T, N, D).
+
+        S is `samples`, or evaluation.samples by default.
+        """
+        s = samples or self.spec.samples
+        starts = states[:, :1].repeat(s, 1, 1, 1)
+        made = predictor.free_run(starts, self.steps, self.generator, deterministic=deterministic)
+        return made.reshape(s, *states.shape)
+
+    def one_step(self, predictor: Predictor, states: Tensor) -> float:
+        """Return the mean squared error of one-step predictions of states (B, T, N, D), in scaled units."""
+        predicted = predictor.one_step(states, self.generator)
+        return one_step_mse(to_numpy(predicted), to_numpy(states[:, 1:]))
+
+
+class LaneEvaluator(Evaluator):
+    """Y-Junction: rollouts from the first state, measured by the distance to the nearer lane."""
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """One sampled rollout from every validation start and from some training starts."""
-        chosen = self.some_training_trajectories()
-        validation, train = self.data.validation, self.data.train[chosen.numpy()]
-        trained = self.setting.experts.states[chosen.to(self.device), :1]
-        positions = self._free_run(predictor, torch.cat([self.validation_states[:, :1], trained]))
-        values: dict[str, float] = {}
-        parts = {
-            "validation": (positions[: len(validation)], validation),
-            "train": (positions[len(validation) :], train),
+        """Roll out once from every validation start and from some training starts."""
+        chosen = self.draw_training()
+        trained = self.context.experts.states[chosen.to(self.device), :1]
+        starts = torch.cat([self.validation_states[:, :1], trained])
+        positions = self.raw_positions(predictor.free_run(starts, self.steps, self.generator))
+        count, lines = len(self.data.validation), self.data.centre_lines
+        validation, train = self.data.validation.continuations, self.data.train[chosen.numpy()].continuations
+        return {
+            **_prefixed("validation", lane_metrics(positions[:count], validation, lines, self.scaling)),
+            **_prefixed("train", lane_metrics(positions[count:], train, lines, self.scaling)),
         }
-        for split, (predicted, truth) in parts.items():
-            measured = quick_metrics(predicted, truth, self.data.centre_lines, self.scaling)
-            values |= {f"{split}/{name}": value for name, value in measured.items()}
-        return values
 
-    def rank(self, values: dict[str, float]) -> tuple[bool, float]:
-        """The smallest validation mode_mse among the epochs that use every mode.
+    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
+        """Rank by validation mode_mse, and epochs that use every mode before all others.
 
-        The error is the distance to the nearest mode, so by itself it would prefer a model that dropped one.
+        mode_mse is the distance to the nearest mode; by itself it would favor a model that has dropped one.
         """
         error, balance = values["validation/mode_mse"], values["validation/lane_balance"]
-        return balance < self.spec.evaluation.least_balance or not math.isfinite(error), error
+        return balance < self.spec.least_balance or not math.isfinite(error), error
 
-    def final(self, best: Predictor, last: Predictor) -> tuple[dict[str, float], Arrays]:
-        """The model of best validation, sampled and by its mean; the last model; and constant velocity."""
+    def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
+        """Evaluate the best model, sampled and by its mean actions, the last model, and constant velocity."""
         truth, lines = self.data.test, self.data.centre_lines
         states = self.states(truth)
-        sampled = self._samples(best, states)
+        sampled = self.sample(best, states)
         candidates = {
             "test": (best, sampled),
-            "test_mean": (best, self._samples(best, states, deterministic=True)),
-            "test_last": (last, self._samples(last, states)),
-            "test_constant_velocity": (self.reference, self._samples(self.reference, states, samples=1)),
+            "test_mean": (best, self.sample(best, states, deterministic=True)),
+            "test_last": (last, self.sample(last, states)),
+            "test_constant_velocity": (self.constant_velocity, self.sample(self.constant_velocity, states, samples=1)),
         }
         values: dict[str, float] = {}
         for prefix, (predictor, samples) in candidates.items():
-            measured = full_metrics(samples, truth, lines, self.scaling)
-            measured["one_step_mse"] = self.one_step(predictor, states)
-            values |= {f"{prefix}/{name}": value for name, value in measured.items()}
-        arrays: Arrays = {
-            "test/rollouts": sampled.astype(np.float32),
+            measured = lane_test_metrics(self.raw_positions(samples), truth, lines, self.scaling)
+            values |= _prefixed(prefix, {**measured, "one_step_mse": self.one_step(predictor, states)})
+        return values, {
+            "test/rollouts": self.raw_positions(sampled).astype(np.float32),
             "test/expert": truth.positions.astype(np.float32),
             "test/lanes": truth.continuations.astype(np.float32),
             "train/expert": self.data.train.positions.astype(np.float32),
             "train/lane": self.data.train.mode,
             "lane_centres": lines.astype(np.float32),
         }
-        return values, arrays
-
-    def _free_run(self, predictor: Predictor, observed: Tensor, deterministic: bool = False) -> Floats:
-        """Raw positions (B, T, N, P) of one free-running rollout from each start (B, 1, N, D), the start included."""
-        steps = self.setting.steps
-        return self.raw_positions(predictor.free_run(observed, steps, self.generator, deterministic=deterministic))
-
-    def _samples(
-        self, predictor: Predictor, states: Tensor, deterministic: bool = False, samples: int | None = None
-    ) -> Floats:
-        """(S, B, T, N, P) raw positions: S rollouts of every start, spec.evaluation.samples by default."""
-        s = samples or self.spec.evaluation.samples
-        positions = self._free_run(predictor, states[:, :1].repeat(s, 1, 1, 1), deterministic)
-        return positions.reshape(s, len(states), *positions.shape[1:])
 
 
-class LetterEvaluator(_Evaluator):
-    """Letters: free-running from the first state, judged by the distance to the letter that was meant."""
+class LetterEvaluator(Evaluator):
+    """Letters: rollouts from the first state, measured by the distance to each agent's letter."""
 
-    STARTS = 16  # test starts from which the untrained predictor is rolled out
+    UNTRAINED_STARTS = 16  # test starts from which the untrained model is rolled out
 
-    def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
-        super().__init__(spec, data, setting)
-        self.begin = first_letter_step(data.train.positions.shape[1])
+    def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
+        super().__init__(context, data)
+        self.first_letter_step = first_letter_step(data.train.positions.shape[1])
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """One sampled rollout from every validation start and from some training starts."""
-        trained = self.setting.experts.states[self.some_training_trajectories().to(self.device)]
+        """Roll out once from every validation start and from some training starts."""
+        trained = self.context.experts.states[self.draw_training().to(self.device)]
         truth = torch.cat([self.validation_states, trained])
-        made = predictor.free_run(truth[:, :1], self.setting.steps, self.generator)
-        values: dict[str, float] = {}
-        parts = {"validation": slice(len(self.validation_states)), "train": slice(len(self.validation_states), None)}
-        for split, part in parts.items():
-            measured = self._measure(made[None, part], truth[part])
-            values |= {f"{split}/{name}": value for name, value in measured.items()}
-        return values
+        made, count = self.sample(predictor, truth, samples=1), len(self.validation_states)
+        return {
+            **_prefixed("validation", self._measure(made[:, :count], truth[:count])),
+            **_prefixed("train", self._measure(made[:, count:], truth[count:])),
+        }
 
-    def rank(self, values: dict[str, float]) -> tuple[bool, float]:
-        """The smallest validation stroke_distance.
+    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
+        """Rank by validation stroke_distance, the measure of the letters.
 
-        It is what the letters are judged by. The mse also asks for the tempo, and prefers a vague letter in time to a
-        clear one that comes late.
+        The mse also depends on the tempo, and prefers a vague letter in time to a clear one that comes late.
         """
         error = values["validation/stroke_distance"]
         return not math.isfinite(error), error
 
-    def final(self, best: Predictor, last: Predictor) -> tuple[dict[str, float], Arrays]:
-        """The model of best validation, sampled and by its mean; the last model; constant velocity; the expert."""
+    def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
+        """Evaluate the best model, sampled and by its mean actions, the last model, constant velocity, and the expert.
+
+        The arrays also hold rollouts of the untrained model.
+        """
         truth = self.states(self.data.test)
-        sampled = self._samples(best, truth)
+        sampled = self.sample(best, truth)
         candidates = {
             "test": sampled,
-            "test_mean": self._samples(best, truth, deterministic=True),
-            "test_last": self._samples(last, truth),
-            "test_constant_velocity": self._samples(self.reference, truth, samples=1),
+            "test_mean": self.sample(best, truth, deterministic=True),
+            "test_last": self.sample(last, truth),
+            "test_constant_velocity": self.sample(self.constant_velocity, truth, samples=1),
         }
         values: dict[str, float] = {}
         for prefix, samples in candidates.items():
-            measured = self._measure(samples, truth)
-            values |= {f"{prefix}/{name}": value for name, value in measured.items()}
-        for prefix, predictor in {"test": best, "test_constant_velocity": self.reference}.items():
+            values |= _prefixed(prefix, self._measure(samples, truth))
+        for prefix, predictor in {"test": best, "test_constant_velocity": self.constant_velocity}.items():
             values[f"{prefix}/one_step_mse"] = self.one_step(predictor, truth)
         expert = self._measure(truth[None], truth)
-        values |= {f"test_expert/{name}": value for name, value in expert.items() if "stroke" in name}
+        values |= _prefixed("test_expert", {name: value for name, value in expert.items() if "stroke" in name})
         return values, {
             "test/rollouts": self.raw_positions(sampled).astype(np.float32),
             "test/expert": self.data.test.positions.astype(np.float32),
             "train/expert": self.data.train.positions.astype(np.float32),
             "letters": self.data.centre_lines.astype(np.float32),
-            "first_letter_step": np.array([self.begin]),
+            "first_letter_step": np.array([self.first_letter_step]),
+            **self._untrained_rollouts(untrained, truth),
         }
 
-    def beginning(self, untrained: Predictor) -> Arrays:
-        """One sampled rollout, and one by its mean, from each of the first test starts. Nothing is drawn from the
-        evaluation's generator.
-        """
-        starts = self.states(self.data.test)[: self.STARTS, :1]
-        made = {}
+    def _untrained_rollouts(self, untrained: Predictor, truth: Tensor) -> Arrays:
+        """Roll out from the first test starts, sampled and by mean actions, with a generator of their own."""
+        arrays: Arrays = {}
         for name, deterministic in (("initial", False), ("initial_mean", True)):
-            generator = torch.Generator().manual_seed(self.setting.generators.seeds["evaluation"])
-            states = untrained.free_run(starts, self.setting.steps, generator, deterministic=deterministic)
-            made[f"{name}/rollouts"] = self.raw_positions(states).astype(np.float32)
-        return made
-
-    def _samples(
-        self, predictor: Predictor, states: Tensor, deterministic: bool = False, samples: int | None = None
-    ) -> Tensor:
-        """(S, B, T, N, D) scaled states: S rollouts of every start, spec.evaluation.samples by default."""
-        s = samples or self.spec.evaluation.samples
-        starts = states[:, :1].repeat(s, 1, 1, 1)
-        made = predictor.free_run(starts, self.setting.steps, self.generator, deterministic=deterministic)
-        return made.reshape(s, *states.shape)
+            generator = torch.Generator().manual_seed(self.context.generators.seeds["evaluation"])
+            starts = truth[: self.UNTRAINED_STARTS, :1]
+            states = untrained.free_run(starts, self.steps, generator, deterministic=deterministic)
+            arrays[f"{name}/rollouts"] = self.raw_positions(states).astype(np.float32)
+        return arrays
 
     def _measure(self, predicted: Tensor, truth: Tensor) -> dict[str, float]:
-        return letter_metrics(
-            as_doubles(predicted), as_doubles(truth), self.data.centre_lines, self.begin, self.scaling
-        )
+        """Return the letter metrics of scaled states (S, B, T, N, D) against truth (B, T, N, D)."""
+        letters, begin = self.data.centre_lines, self.first_letter_step
+        return letter_metrics(to_numpy(predicted), to_numpy(truth), letters, begin, self.scaling)
 
 
-class ForecastEvaluator(_Evaluator):
-    """Recorded motion: some frames are observed, the following ones predicted, with and without noise on what is read
-    (section 4.6; the windows are those of DNRI's protocol). Raises InputError when the test windows are too short.
+class ForecastEvaluator(Evaluator):
+    """Recorded motion: observe some frames and predict the following ones, with and without noise on the input.
+
+    Section 4.6; the windows follow DNRI's protocol. Raises InputError if the test windows are too short.
     """
 
-    KEPT = 4  # test windows whose predictions are stored as trajectories
+    KEPT_WINDOWS = 4  # test windows whose predictions are stored
 
-    def __init__(self, spec: RunSpec, data: ExpertSet, setting: Setting) -> None:
-        super().__init__(spec, data, setting)
-        self.forecast = required(spec.forecast)
+    def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
+        super().__init__(context, data)
+        self.forecast = required(context.spec.forecast)
         self._check_windows()
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """One sampled rollout of each validation window from its first frame, and of some training windows."""
-        trained = self.setting.experts.states[self.some_training_trajectories().to(self.device)]
+        """Predict each validation window from its first frame, and some training windows, once."""
+        trained = self.context.experts.states[self.draw_training().to(self.device)]
         values: dict[str, float] = {}
         for split, truth in {"validation": self.validation_states, "train": trained}.items():
             predicted = predictor.free_run(truth[:, :1], truth.shape[1] - 1, self.generator)
-            measured, _ = forecast_metrics(as_doubles(predicted[None, :, 1:]), as_doubles(truth[:, 1:]), self.scaling)
-            values |= {f"{split}/{name}": value for name, value in measured.items()}
+            measured, _ = forecast_metrics(to_numpy(predicted[None, :, 1:]), to_numpy(truth[:, 1:]), self.scaling)
+            values |= _prefixed(split, measured)
         return values
 
-    def rank(self, values: dict[str, float]) -> tuple[bool, float]:
-        """The smallest validation mse, over all predicted steps."""
+    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
+        """Rank by validation mse over all predicted steps."""
         error = values["validation/mse"]
         return not math.isfinite(error), error
 
-    def final(self, best: Predictor, last: Predictor) -> tuple[dict[str, float], Arrays]:
-        """The model of best validation, clean and noisy, sampled and by its mean; the last model; the references."""
+    def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
+        """Evaluate the best model, clean and noisy, sampled and by its mean; the last model; the baselines."""
         states = self.states(self.data.test)
-        candidates = {
+        candidates = {  # predictor, deterministic, noisy
             "test": (best, False, False),
             "test_noisy": (best, False, True),
             "test_mean": (best, True, False),
             "test_mean_noisy": (best, True, True),
             "test_last": (last, False, False),
-            "test_constant_velocity": (self.reference, True, False),
-            "test_constant_velocity_noisy": (self.reference, True, True),
+            "test_constant_velocity": (self.constant_velocity, True, False),
+            "test_constant_velocity_noisy": (self.constant_velocity, True, True),
             "test_copy_last": (CopyLast(), True, False),
             "test_copy_last_noisy": (CopyLast(), True, True),
         }
@@ -276,13 +252,13 @@ class ForecastEvaluator(_Evaluator):
         for prefix, (predictor, deterministic, noisy) in candidates.items():
             predicted, truth = self._predict(predictor, states, deterministic, noisy)
             measured, curves = forecast_metrics(predicted, truth, self.scaling)
-            values |= {f"{prefix}/{name}": value for name, value in measured.items()}
+            values |= _prefixed(prefix, measured)
             arrays |= {f"{prefix}/{name}": curve for name, curve in curves.items()}
             if prefix in ("test", "test_noisy"):
-                arrays[f"{prefix}/predictions"] = self._positions(predicted[:1])
-        for prefix, predictor in {"test": best, "test_constant_velocity": self.reference}.items():
+                arrays[f"{prefix}/predictions"] = self._kept_positions(predicted[0])
+        for prefix, predictor in {"test": best, "test_constant_velocity": self.constant_velocity}.items():
             values[f"{prefix}/one_step_mse"] = self.one_step(predictor, states)
-        arrays["test/expert"] = self._positions(truth[None])
+        arrays["test/expert"] = self._kept_positions(truth)
         return values, arrays
 
     def _check_windows(self) -> None:
@@ -294,25 +270,24 @@ class ForecastEvaluator(_Evaluator):
                 f"but the test windows of the data have {frames}; lower one of the two with --set."
             )
 
-    def _positions(self, states: Floats) -> np.ndarray:
-        """Raw positions of the first KEPT windows of (1, B, T, N, D) scaled states."""
-        scaled = states[0, : self.KEPT, ..., : states.shape[-1] // 2]
+    def _kept_positions(self, states: Floats) -> np.ndarray:
+        """Return raw positions of the first KEPT_WINDOWS windows of scaled states (B, T, N, D)."""
+        scaled = states[: self.KEPT_WINDOWS, ..., : states.shape[-1] // 2]
         raw: np.ndarray = self.scaling.unscale_positions(scaled).astype(np.float32)
         return raw
 
     def _predict(self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: bool) -> tuple[Floats, Floats]:
-        """(S, B, T', N, D) predictions of the frames after the observed ones, and the truth (B, T', N, D)."""
+        """Return predictions (S, B, T', N, D) of the frames after the observed ones, and the truth (B, T', N, D)."""
         h, steps, b = self.forecast.observed, self.forecast.predicted, len(states)
-        always_the_same = isinstance(predictor, (ConstantVelocity, CopyLast)) and not noisy
-        samples = 1 if always_the_same else self.spec.evaluation.samples
+        samples = 1 if isinstance(predictor, Baseline) and not noisy else self.spec.samples
         observed = states[:, :h].repeat(samples, 1, 1, 1)
-        noise = self._noise(observed, steps) if noisy else None
+        noise = self._input_noise(observed, steps) if noisy else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
-        made = as_doubles(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
-        return made, as_doubles(states[:, h : h + steps])
+        made = to_numpy(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
+        return made, to_numpy(states[:, h : h + steps])
 
-    def _noise(self, observed: Tensor, steps: int) -> Tensor:
-        """The noise on every state that is read, the same for all methods and seeds."""
+    def _input_noise(self, observed: Tensor, steps: int) -> Tensor:
+        """Draw the noise on every state that a predictor reads: the same for all methods and seeds."""
         generator = torch.Generator().manual_seed(self.forecast.noise_seed)
         b, h, n, d = observed.shape
         noise = self.forecast.noise * torch.randn(b, h + steps - 1, n, d, generator=generator)
@@ -321,8 +296,17 @@ class ForecastEvaluator(_Evaluator):
         return noise.to(self.device)
 
 
-EVALUATORS: dict[str, Callable[[RunSpec, ExpertSet, Setting], Evaluator]] = {
+EVALUATORS: dict[str, type[Evaluator]] = {
     "yjunction": LaneEvaluator,
     "letters": LetterEvaluator,
     "mocap": ForecastEvaluator,
 }
+
+
+def make_evaluator(context: LearnerContext, data: ExpertSet) -> Evaluator:
+    """Make the evaluator of the spec's environment."""
+    return EVALUATORS[context.spec.environment](context, data)
+
+
+def _prefixed(prefix: str, values: Mapping[str, float]) -> dict[str, float]:
+    return {f"{prefix}/{name}": value for name, value in values.items()}

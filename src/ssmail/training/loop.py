@@ -1,11 +1,11 @@
-"""The training loop: epochs of rollouts and updates, validation, the best model, and everything needed to continue
-later.
+"""The training loop: epochs of training and validation, the best model, landscapes, and the state to resume from.
 
-It yields metrics and knows nothing of where they are stored.
+It returns metrics and does not know where they are stored.
 """
 
 import math
 import time
+from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -14,25 +14,39 @@ import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
-from ssmail.data.expert_file import load
-from ssmail.data.generators import generate
+from ssmail.data.expert_sets import generate, load
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
+from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
+from ssmail.training.batches import Batch
+from ssmail.training.cloning import CloningLearner
 from ssmail.training.evaluators import make_evaluator
-from ssmail.training.experts import scaled_batch
-from ssmail.training.landscapes import Landscapes, looks
-from ssmail.training.learning import Setting
-from ssmail.training.methods import make_learner
+from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
+from ssmail.training.learner import Learner, LearnerContext
 from ssmail.training.seeding import Generators
+from ssmail.training.variational import VariationalLearner
+
+LEARNERS: dict[str, Callable[[LearnerContext], Learner]] = {
+    "ssail": AdversarialLearner,
+    "gail": AdversarialLearner,
+    "wail": AdversarialLearner,
+    "bc": CloningLearner,
+    "nri": VariationalLearner,
+    "dnri": VariationalLearner,
+    "constant-velocity": lambda context: BaselineLearner(ConstantVelocity(context.integrator)),
+    "copy-last": lambda context: BaselineLearner(CopyLast()),
+}
+"""The table of methods."""
 
 
 class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fault
-    """Training left the finite numbers."""
+    """Weights became NaN or infinite."""
 
 
 def expert_set(spec: RunSpec) -> ExpertSet:
-    """The expert data of a spec: its file, or the generator's set when it names none."""
+    """Load the expert data of a spec from its file, or generate it if the spec names none."""
     if spec.data.path is not None:
         return load(Path(spec.data.path), spec.environment)
     return generate(spec.data)
@@ -41,7 +55,8 @@ def expert_set(spec: RunSpec) -> ExpertSet:
 class TrainingLoop:
     """One run. Call `run_epoch` until `epoch` reaches spec.epochs, then `final_evaluation`.
 
-    `snapshot` holds the arrays to keep of the epoch that has just ended, or of the untrained model; mostly none.
+    snapshot: the arrays to store of the epoch that has just ended, or of the untrained model; mostly empty.
+    improved: whether the epoch that has just ended is the best so far.
     """
 
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
@@ -50,59 +65,63 @@ class TrainingLoop:
         self.dataset_hash = self.data.hash
         self.scaling = self.data.scaling
         self.generators = Generators(seed)
-        self.experts = scaled_batch(self.data.train, self.scaling, self.device)
+        self.experts = Batch.from_trajectories(self.data.train, self.scaling, self.device)
         self.integrator = Integrator(self.scaling)
-        setting = Setting(spec, self.experts, self.integrator, self.generators)
-        self.learner = make_learner(setting)
-        self.evaluator = make_evaluator(spec, self.data, setting)
+        context = LearnerContext(spec, self.experts, self.integrator, self.generators)
+        self.learner = LEARNERS[spec.method](context)
+        self.evaluator = make_evaluator(context, self.data)
         self.epoch = 0
         self.improved = False
         self.best_flawed = True
         self.best_error = math.inf
         self.best_epoch = 0
-        self.best_weights = deepcopy(self.learner.predictor.state_dict())
+        self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
         self.untrained = deepcopy(self.learner.predictor)
-        self.landscapes = Landscapes.of(setting, self.learner)
+        self.landscapes = LandscapeRecorder.for_learner(context, self.learner)
         self.snapshot: dict[str, np.ndarray] = {}
-        self._look()
+        self._record_landscape()
 
     def run_epoch(self) -> dict[str, float]:
-        """One epoch of training and its validation; returns the epoch's metrics. Raises Divergence when weights stop
-        being finite.
+        """Train and validate for one epoch and return its metrics.
+
+        Raises Divergence if a weight is not finite. The order of the steps is part of a run's numbers: a checkpoint
+        taken after the call continues as if never interrupted.
         """
         began = time.perf_counter()
+        # 1. Train. 2. Validate, drawing from the evaluation generator.
         values = self.learner.run_epoch(self.epoch)
         self._check_finite()
         values |= self.evaluator.epoch(self.learner.predictor)
+        # 3. Count the epoch and compare it with the best one. 4. Record a landscape, with its own generator.
         self.epoch += 1
         self._select(*self.evaluator.rank(values))
-        values |= self._look()
+        values |= self._record_landscape()
         return values | {"seconds": time.perf_counter() - began}
 
-    def _look(self) -> dict[str, float]:
-        """Look at the learned reward, if this is an epoch for it: the numbers; the arrays are `snapshot`."""
+    def _record_landscape(self) -> dict[str, float]:
+        """Put this epoch's landscape into `snapshot` and return its metrics, if the spec asks for one."""
         values: dict[str, float] = {}
         self.snapshot = {}
-        if self.landscapes is not None and self.epoch in looks(self.spec):
-            values, self.snapshot = self.landscapes.look(self.epoch)
+        if self.landscapes is not None and self.epoch in landscape_epochs(self.spec):
+            values, self.snapshot = self.landscapes.record(self.epoch)
         return values
 
     def _select(self, flawed: bool, error: float) -> None:
-        """Keep this epoch's model if it is the best so far by the evaluator's rank."""
+        """Keep this epoch's weights if the evaluator ranks it best so far."""
         self.improved = (flawed, error) < (self.best_flawed, self.best_error)
         if self.improved:
             self.best_flawed, self.best_error, self.best_epoch = flawed, error, self.epoch
-            self.best_weights = deepcopy(self.learner.predictor.state_dict())
+            self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """The metrics of the best and the last model on the test split, and the arrays to draw."""
+        """Return the metrics of the best and the last model on the test split, and the arrays to draw."""
         best = deepcopy(self.learner.predictor)
-        best.load_state_dict(self.best_weights)
-        values, arrays = self.evaluator.final(best, self.learner.predictor)
-        return {"best_epoch": float(self.best_epoch), **values}, {**arrays, **self.evaluator.beginning(self.untrained)}
+        best.model.load_state_dict(self.best_weights)
+        values, arrays = self.evaluator.final(best, self.learner.predictor, self.untrained)
+        return {"best_epoch": float(self.best_epoch), **values}, arrays
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue as if never interrupted: tensors and plain data only."""
+        """Return everything needed to continue as if never interrupted, as tensors and plain data."""
         return {
             "epoch": self.epoch,
             "best": {
@@ -111,21 +130,22 @@ class TrainingLoop:
                 "epoch": self.best_epoch,
                 "weights": self.best_weights,
             },
-            "learner": self.learner.state_dict(),
+            "learner": {name: part.state_dict() for name, part in self.learner.parts().items()},
             "generators": self.generators.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`, for a loop made with the same spec and seed."""
+        """Inverse of `state_dict`, for a loop with the same spec and seed."""
         self.epoch, self.snapshot = state["epoch"], {}
         best = state["best"]
         self.best_flawed, self.best_error = best["flawed"], best["error"]
         self.best_epoch, self.best_weights = best["epoch"], best["weights"]
-        self.learner.load_state_dict(state["learner"])
+        for name, part in self.learner.parts().items():
+            part.load_state_dict(state["learner"][name])
         self.generators.load_state_dict(state["generators"])
 
     def best_state_dict(self) -> dict[str, Any]:
-        """The policy of the best validation error so far, with its epoch and error."""
+        """Return the weights with the best validation error so far, with their epoch and error."""
         return {"epoch": self.best_epoch, "error": self.best_error, "policy": self.best_weights}
 
     def _check_finite(self) -> None:

@@ -1,4 +1,4 @@
-"""Generating trajectories: the policy and the environment, step by step."""
+"""Rollouts of a graph policy in the trajectory environment, and the policy as a Predictor."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from ssmail.models.features import Features
 from ssmail.models.graph_encoder import Memory
 from ssmail.models.policy import GraphPolicy
 
-READ_AT_ONCE = 10  # observed steps: with the edges of recorded motion all of them together are gigabytes
+ENCODER_CHUNK = 10  # observed steps read at once; on recorded motion the edges of all steps together take gigabytes
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,15 @@ def rollout(
     deterministic: bool = False,
     noise: Tensor | None = None,
 ) -> Rollout:
-    """Roll the policy out for `steps` actions from the last of the states `observed` (B, H, N, D); the graph encoder
-    has read the others.
+    """Roll the policy out for `steps` actions from the last of the `observed` states (B, H, N, D).
 
-    Where `interventions` (B, T) is set, the group is put on the state of `expert` (B, T, N, D) before it acts.
-    `deterministic` takes the mean action; the graph is sampled all the same. `noise` (B, H + T - 1, N, D) is added to
-    every state that the policy reads, not to where the group is.
+    The graph encoder reads the earlier observed states first. At steps where `interventions` (B, T) is set, the group
+    is moved to the state of `expert` (B, T, N, D) before it acts. `deterministic` takes the mean action; the graph is
+    sampled in any case. `noise` (B, H + T - 1, N, D) is added to every state that the policy reads; the environment's
+    state stays clean.
     """
     b, h, n, _ = observed.shape
+    # Draw all noise up front.
     graph_noise = policy.draw_graph_noise(b, steps, n, generator).to(observed.device)
     action_noise = torch.randn(steps, b, 1, n, policy.action_size, generator=generator).to(observed.device)
     if deterministic:
@@ -54,15 +55,18 @@ def rollout(
     if noise is None:
         noise = observed.new_zeros(1, h + steps - 1, 1, 1)
     start = observed[:, 0] + noise[:, 0]
+    # Warm up the encoder's memory on the observed history.
     memory: Memory | None = None
-    for first in range(0, h - 1, READ_AT_ONCE):
-        part = slice(first, min(first + READ_AT_ONCE, h - 1))
+    for first in range(0, h - 1, ENCODER_CHUNK):
+        part = slice(first, min(first + ENCODER_CHUNK, h - 1))
         _, memory = policy.encoder(features(observed[:, part] + noise[:, part], start, first), memory)
     state = observed[:, -1:]
     states, actions = [], []
     for t in range(steps):
+        # Curriculum: put the group back on the expert's track.
         if interventions is not None and expert is not None:
             state = torch.where(interventions[:, t].view(b, 1, 1, 1), expert[:, t : t + 1], state)
+        # Policy: read the state, infer the graph, act.
         read = state + noise[:, h - 1 + t : h + t]
         x = features(read, start, h - 1 + t)
         at = t if graph_noise.shape[1] > 1 else 0
@@ -70,5 +74,42 @@ def rollout(
         action = policy.actor.sample(x, graph, read[..., policy.action_size :], action_noise[t])
         states.append(state)
         actions.append(action)
+        # Environment.
         state = integrator.step(state, action)
     return Rollout(torch.cat([*states, state], dim=1), torch.cat(actions, dim=1))
+
+
+@dataclass(frozen=True)
+class PolicyPredictor:
+    """The Predictor of a graph policy. It samples the graphs in every case."""
+
+    model: GraphPolicy
+    features: Features
+    integrator: Integrator
+
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """See Predictor."""
+        policy, features, integrator = self.model, self.features, self.integrator
+        return rollout(
+            policy, features, integrator, observed, steps, generator, deterministic=deterministic, noise=noise
+        ).states
+
+    @torch.no_grad()
+    def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """See Predictor."""
+        now = states[:, :-1]
+        b, t, n, _ = now.shape
+        x = self.features(now, states[:, 0])
+        noise = self.model.draw_graph_noise(b, t, n, generator).to(now.device)
+        graphs, _, _ = self.model.graphs(x, noise)
+        a = self.model.action_size
+        no_noise = torch.zeros(b, t, n, a, device=now.device)
+        return self.integrator.step(now, self.model.actor.sample(x, graphs, now[..., a:], no_noise))

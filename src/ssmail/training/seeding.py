@@ -1,6 +1,4 @@
-"""One seed -> independent generators, so that e.g. a change of the alpha range leaves the initial weights as they
-were.
-"""
+"""Independent random generators from one seed: changing one use of randomness leaves the others as they were."""
 
 from typing import Any
 
@@ -11,8 +9,9 @@ PURPOSES = ("data", "weights", "policy", "alpha", "curriculum", "evaluation")
 
 
 class Generators:
-    """One torch generator for each purpose: data order, initial weights, policy noise, alpha, interventions,
-    evaluation rollouts.
+    """One torch generator per purpose: data order, initial weights, policy noise, alpha, interventions, evaluation.
+
+    A change of the alpha range, for example, does not change the initial weights.
     """
 
     def __init__(self, seed: int) -> None:
@@ -24,7 +23,7 @@ class Generators:
         return self.by_purpose[purpose]
 
     def state_dict(self) -> dict[str, Any]:
-        """The states of all generators."""
+        """Return the states of all generators."""
         return {p: g.get_state() for p, g in self.by_purpose.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ssmail.data import expert_file
-from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
+from ssmail.data import expert_sets
+from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.data.mocap.kinematics import positions
-from ssmail.data.mocap.motion import parse_motion
 from ssmail.data.trajectories import Floats
 
 HEAD = (":FULLY-SPECIFIED", ":DEGREES")
@@ -104,5 +104,5 @@ def write_set(path: Path, frames: Sequence[int] = (41, 31, 49), window: int = 10
     """An expert set of PERSON: one trial of so many frames for each of train, validation and test."""
     folder = write_subject(path.parent / "subject", dict(enumerate(frames, start=1)))
     wanted = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,), window=window, test_window=test_window)
-    expert_file.save(prepare(folder, wanted), path)
+    expert_sets.save(prepare(folder, wanted), path)
     return path

@@ -1,16 +1,13 @@
 """A web site on this machine that serves a subject, and misbehaves as told."""
 
 import hashlib
-import json
-import re
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-
-from ssmail.data.mocap.cache import RECORD
 
 NAMES = ("35.asf", "35_01.amc", "35_02.amc")
 FRAMES = "".join(f"{frame}\r\nroot {frame}.5 17.9 -21 0 -8 -7\r\n" for frame in range(1, 200)).encode()
@@ -39,6 +36,13 @@ class Site:
 
     def names(self) -> list[str]:
         return [path.rpartition("/")[2] for path, _ in self.asked]
+
+    def asked_for(self, name: str, within: float) -> bool:
+        """Whether a file is asked for in so many seconds."""
+        deadline = time.monotonic() + within
+        while name not in self.names() and time.monotonic() < deadline:
+            threading.Event().wait(0.005)  # time.sleep is patched
+        return name in self.names()
 
     def headers(self, header: str) -> list[str | None]:
         return [headers.get(header) for _, headers in self.asked]
@@ -90,56 +94,28 @@ def serving() -> Iterator[Site]:
 
 
 def assert_whole(folder: Path, site: Site) -> None:
-    """Each file as served, nothing else but the record, and the record right."""
-    assert sorted(path.name for path in folder.iterdir()) == [*NAMES, RECORD]
-    record = json.loads((folder / RECORD).read_text())
-    assert record["partial"] == {}
+    """Each file as served, and nothing else."""
+    assert sorted(path.name for path in folder.iterdir()) == list(NAMES)
     for name in NAMES:
-        served = site.files[f"/subjects/35/{name}"]
-        assert (folder / name).read_bytes() == served
-        assert record["whole"][name]["sha256"] == hashlib.sha256(served).hexdigest()
-        assert record["whole"][name]["size"] == len(served)
+        assert (folder / name).read_bytes() == site.files[f"/subjects/35/{name}"]
 
 
-def tag(body: bytes) -> str:
-    return f'"{len(body)}-{sum(body)}"'
+def digests(site: Site) -> dict[str, str]:
+    """The SHA-256 of every file that the site serves well, by name."""
+    return {path.rpartition("/")[2]: hashlib.sha256(body).hexdigest() for path, body in site.files.items()}
 
 
 def well(request: Request, body: bytes) -> None:
-    """As RFC 9110 has it."""
-    if not body:
-        request.answer(404, PAGE)
-        return
-    asked = re.fullmatch(r"bytes=(\d+)-", request.headers.get("Range", ""))
-    if asked and request.headers.get("If-Range") in (tag(body), DATE):
-        first = int(asked[1])
-        if first >= len(body):
-            request.answer(416, b"", Content_Range=f"bytes */{len(body)}")
-            return
-        span = f"bytes {first}-{len(body) - 1}/{len(body)}"
-        request.answer(206, body[first:], ETag=tag(body), Content_Range=span)
-        return
-    request.answer(200, body, ETag=tag(body))
+    request.answer(200 if body else 404, body or PAGE)
 
 
-DATE = "Sat, 21 Feb 2004 10:00:00 GMT"
-
-
-def cut(after: int, **headers: str) -> Answer:
+def cut(after: int) -> Answer:
     """The whole length is announced, the connection ends after so many bytes."""
-
-    def answer(request: Request, body: bytes) -> None:
-        request.answer(200, body[:after], length=len(body), **(headers or {"ETag": tag(body)}))
-
-    return answer
+    return lambda request, body: request.answer(200, body[:after], length=len(body))
 
 
 def status(code: int, body: bytes = PAGE, **headers: str) -> Answer:
     return lambda request, _: request.answer(code, body, **headers)
-
-
-def without_ranges(request: Request, body: bytes) -> None:
-    request.answer(200, body, ETag=tag(body))
 
 
 def without_length(request: Request, body: bytes) -> None:
@@ -157,35 +133,13 @@ def in_chunks(end: bytes) -> Answer:
     return answer
 
 
-def range_of(first: int, size: int) -> Answer:
-    """A 206 with the rest from `first` of a file said to have `size` bytes, whatever was asked for."""
-
-    def answer(request: Request, body: bytes) -> None:
-        request.answer(206, body[first:], Content_Range=f"bytes {first}-{size - 1}/{size}")
-
-    return answer
-
-
 def silent(released: threading.Event, after: int = 0) -> Answer:
     """So many bytes, and then nothing until the test is over."""
 
     def answer(request: Request, body: bytes) -> None:
         if after:
-            request.answer(200, body[:after], length=len(body), ETag=tag(body))
+            request.answer(200, body[:after], length=len(body))
             request.wfile.flush()
         released.wait(10)
-
-    return answer
-
-
-def trickling(released: threading.Event) -> Answer:
-    """A byte now and then."""
-
-    def answer(request: Request, body: bytes) -> None:
-        request.answer(200, b"", length=len(body), ETag=tag(body))
-        for byte in body:
-            if released.wait(0.01):
-                return
-            request.wfile.write(bytes([byte]))
 
     return answer

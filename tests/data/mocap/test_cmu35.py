@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from ssmail.data.mocap import kinematics
-from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
+from ssmail.data.mocap.amc import Motion, parse_motion
+from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
-from ssmail.data.mocap.motion import Motion, parse_motion
 from ssmail.data.trajectories import ExpertSet, Floats
 
 CMU = os.environ.get("SSMAIL_CMU_DIR")

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.data.mocap.amc import parse_motion
 from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
 from ssmail.data.mocap.kinematics import positions
-from ssmail.data.mocap.motion import parse_motion
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from tests.data.mocap.handmade import PERSON, STILL, amc, skeleton, walk, write_subject

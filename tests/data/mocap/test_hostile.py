@@ -9,9 +9,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ssmail.data.mocap.acclaim import parse_skeleton
+from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.asf import parse_skeleton
 from ssmail.data.mocap.kinematics import positions
-from ssmail.data.mocap.motion import parse_motion
 from ssmail.errors import InputError
 from tests.data.mocap.handmade import PERSON, B, asf, skeleton, walk
 from tests.data.mocap.refusal import sentence_of

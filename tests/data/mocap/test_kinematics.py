@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
+from ssmail.data.mocap.amc import Motion, parse_motion
+from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions, rotation
-from ssmail.data.mocap.motion import Motion, parse_motion
 from ssmail.data.trajectories import Floats
 from tests.data.mocap.handmade import PERSON, STILL, B, asf, posed, walk
 

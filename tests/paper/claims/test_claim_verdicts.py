@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ssmail.evaluation.order_statistics import ALPHA, UNKNOWN, deviations, rank_test
+from ssmail.evaluation.hypothesis_tests import ALPHA, UNKNOWN, deviations, rank_test
 from ssmail.paper.claims import Decision, Part, Sample, Verdict, holm
 from ssmail.paper.hypotheses import every_seed, less_spread, median_seed, smaller
 

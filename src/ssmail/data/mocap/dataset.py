@@ -1,44 +1,41 @@
 """The expert set of Noisy Mocap (section 4.1, B.3): trials of one subject of the CMU database, cut into windows.
 
-The protocol is that of DNRI's authors (reading of the paper in docs/paper.md). With p the positions of a trial's F
-frames, its locations are p[1:] and its velocities p[1:] - p[:-1]. Windows follow one another without overlap from the
-first location on, and the rest that fills no window is dropped: they begin at range(0, F - window, window), with F the
-number of *frames*, which makes every whole window of the F - 1 locations. (Counting locations instead would lose the
-last window of a trial of 50 k + 1 frames; subject 35 has none, and both give 92, 33 and 27 windows.) Windows of the
-test split are longer: half of one is observed and the rest predicted.
+The protocol is that of DNRI's authors (docs/paper.md). A trial with positions p of F frames has the locations p[1:] and
+the velocities p[1:] - p[:-1]. Windows follow one another without overlap from the first location on, and a rest that
+fills no window is dropped. They begin at range(0, F - window, window), where F counts *frames*, so that every whole
+window of the F - 1 locations is used. (Counting locations would lose the last window of a trial of 50 k + 1 frames;
+subject 35 has no such trial, and both yield 92, 33 and 27 windows.) Windows of the test split are longer: half of a
+window is observed and the rest predicted.
 """
 
 import hashlib
-import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ssmail.config.sections import Frozen
-from ssmail.data.mocap.acclaim import Skeleton, parse_skeleton
+from ssmail.data.mocap.acclaim_lines import AGAIN
+from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions
-from ssmail.data.mocap.lines import AGAIN
-from ssmail.data.mocap.motion import parse_motion
 from ssmail.data.mocap.source import Source, find_subject, open_source, shown
-from ssmail.data.scaling import Scaling
-from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories
+from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 
-SPLITS = ("train", "validation", "test")
 MOST_TRIALS = 1000
 Trial = Annotated[int, Field(ge=1, lt=1_000_000)]
 Trials = Annotated[tuple[Trial, ...], Field(min_length=1)]
 
 
 class MocapParameters(Frozen):
-    """What a set of recorded motion was made from: trials by number, windows in frames.
+    """What a set of recorded motion is made from: trials by number, windows in frames.
 
-    missing: trials that were asked for but not there. length_unit: the multiplier in the head of the skeleton file,
-    which is *not* applied; 2.54 / length_unit centimetres are one unit of the positions, in the CMU database.
+    missing: requested trials that the source lacks. length_unit: the multiplier in the header of the skeleton file,
+    which is *not* applied; in the CMU database, one unit of the positions is 2.54 / length_unit centimetres.
     """
 
     environment: Literal["mocap"] = "mocap"
@@ -52,12 +49,12 @@ class MocapParameters(Frozen):
     length_unit: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
 
     def window_of(self, split: str) -> int:
-        """Frames in a window of a split."""
+        """Return the number of frames in a window of a split."""
         return self.test_window if split == "test" else self.window
 
 
 def parse_trials(text: str, option: str) -> tuple[int, ...]:
-    """The trials that an option names: "01-12" or "1-3,7". Raises InputError naming the option."""
+    """Parse the trials that an option names: "01-12" or "1-3,7". Raises InputError that names the option."""
     trials: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r"\s*(\d{1,6})\s*(?:-\s*(\d{1,6})\s*)?", part, re.ASCII)
@@ -73,15 +70,16 @@ def parse_trials(text: str, option: str) -> tuple[int, ...]:
 
 
 def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = False) -> ExpertSet:
-    """The expert set made of the files in a folder or zip file; `missing` and `length_unit` of `wanted` are ignored.
+    """Make the expert set from the files in a folder or zip file; `missing` and `length_unit` of `wanted` are ignored.
 
-    Trajectories are in the units of the skeleton file, (B, window, N, 3), with N joints in the order of that file and
-    the root first; the order of trials is that of `wanted`.
+    Trajectories are (B, window, N, 3) in the units of the skeleton file, the root first and then the joints in the
+    order of that file; trials come in the order of `wanted`.
 
-    Raises InputError when a trial is named twice, a file is missing (unless `allow_missing`, which still needs one
-    trial for each split), doubled, or not as it should be, and when a trial is too short for a window.
+    Raises InputError if a trial is named twice, if a file is missing (`allow_missing` still needs one trial for each
+    split), duplicated or malformed, and if a trial is too short for a window.
     """
     _check_trials(wanted)
+    # choose the trials
     asked = {split: getattr(wanted, split) for split in SPLITS}
     with open_source(source) as files:
         subject = find_subject(files, wanted.subject, (trial for trials in asked.values() for trial in trials))
@@ -92,6 +90,7 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
         for split, trials in used.items():
             if not trials:
                 raise InputError(f"{_lack(source, wanted.subject, missing)}, so nothing is left to {split}; add them")
+        # read the skeleton and the motions, and cut them into windows
         sources: dict[str, str] = {}
         skeleton = parse_skeleton(_read(files, subject.skeleton, sources), _label(files, subject.skeleton))
         splits = {}
@@ -99,39 +98,27 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
             names = {trial: subject.trials[trial] for trial in trials}
             splits[split] = _split(files, names, skeleton, wanted.window_of(split), sources)
     made = wanted.model_copy(update={**used, "missing": missing, "length_unit": skeleton.length_unit})
-    _check_scale(splits["train"], source)
-    return make_expert_set(splits, made, skeleton.joints, skeleton.parents, sources)
+    experts = bundle(splits, made, skeleton.joints, skeleton.parents, sources)
+    try:
+        _ = experts.scaling
+    except ValueError:
+        raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
+    return experts
 
 
-def make_expert_set(
+def bundle(
     splits: Mapping[str, Trajectories],
     params: MocapParameters,
     joints: tuple[str, ...],
     parents: tuple[int, ...],
     sources: Mapping[str, str],
 ) -> ExpertSet:
-    """Bundle the splits with what they were made of and the hash of it. The sources are not in the hash: the same
-    numbers with other line ends are the same data.
-    """
-    parameters = params.model_dump(mode="json")
-    digest = hashlib.sha256(json.dumps([parameters, joints, parents], sort_keys=True).encode())
-    for split in SPLITS:
-        data = splits[split]
-        for array in (data.positions, data.velocities, data.mode, data.trial, data.frame):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    train, validation, test = (splits[split] for split in SPLITS)
-    no_lines = np.empty((0, 0, 3))
-    return ExpertSet(train, validation, test, no_lines, parameters, digest.hexdigest(), joints, parents, dict(sources))
-
-
-def make_trajectories(locations: Floats, velocities: Floats, trial: Integers, frame: Integers) -> Trajectories:
-    """Windows (B, T, N, 3) as trajectories of a single mode, whose continuation is the window itself."""
-    mode = np.zeros(len(locations), dtype=np.int64)
-    return Trajectories(locations, velocities, mode, locations[None], trial, frame)
+    """Put the splits together with the skeleton and the SHA-256 of the source files."""
+    return ExpertSet.bundle(splits, np.empty((0, 0, 3)), params.model_dump(mode="json"), joints, parents, sources)
 
 
 def _check_trials(wanted: MocapParameters) -> None:
-    """Whether every trial is named once: one that is trained on must not be tested on."""
+    """Raise InputError if a trial is named twice: the test split must not contain a training trial."""
     seen: dict[int, str] = {}
     for split in SPLITS:
         for trial in getattr(wanted, split):
@@ -149,7 +136,7 @@ def _lack(source: Path, subject: int, missing: Iterable[int]) -> str:
 def _split(
     files: Source, names: Mapping[int, str], skeleton: Skeleton, window: int, sources: dict[str, str]
 ) -> Trajectories:
-    """The windows of some trials, one after the other; `sources` gains their checksums."""
+    """Cut trials into windows, one trial after the other, and add the digests of their files to `sources`."""
     parts: list[tuple[Floats, Floats]] = []
     trials: list[int] = []
     frames: list[int] = []
@@ -161,21 +148,14 @@ def _split(
                 f"{label} has {len(motion)} frames, too few for a window of {window} and one before it; "
                 f"leave trial {trial:02d} out"
             )
-        placed = positions(skeleton, motion)
+        placed = positions(skeleton, motion)  # (F, N, 3)
         starts = range(0, len(motion) - window, window)
         index = np.add.outer(starts, np.arange(window))  # (windows, window)
         parts.append((placed[1:][index], np.diff(placed, axis=0)[index]))
         trials += [trial] * len(starts)
         frames += [motion.first + 1 + start for start in starts]
     locations, velocities = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return make_trajectories(locations, velocities, np.array(trials), np.array(frames))
-
-
-def _check_scale(train: Trajectories, source: Path) -> None:
-    try:
-        Scaling.fit(train.positions, train.velocities)
-    except ValueError:
-        raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
+    return Trajectories.single_mode(locations, velocities, np.array(trials), np.array(frames))
 
 
 def _read(files: Source, name: str, sources: dict[str, str]) -> bytes:
@@ -186,8 +166,3 @@ def _read(files: Source, name: str, sources: dict[str, str]) -> bytes:
 
 def _label(files: Source, name: str) -> str:
     return shown(str(files.path / name))
-
-
-def parameters_from(text: Any) -> MocapParameters:
-    """The parameters inside a file. Raises ValueError."""
-    return MocapParameters.model_validate_json(str(text))

@@ -1,36 +1,35 @@
 """Forward kinematics of an Acclaim skeleton: joint angles to positions, all frames at once.
 
-Conventions, column vectors throughout. A triple of angles with the order "xyz" turns about x first, then about y, then
-about z, each time about axes that stay where they are; so the matrix is Rz Ry Rx, the first turn on the right.
+Conventions: vectors are columns. Three angles with the order "xyz" turn about x first, then y, then z, each time about
+fixed axes, so the matrix is Rz Ry Rx, with the first turn on the right.
 
-Why a bone turns as it does. The skeleton file describes the rest pose in global coordinates: the direction d of a
-bone, and its local axes, which are the columns of C (the bone's `axis` angles). A frame gives the angles of the joint
-about these local axes. In local coordinates they make the rotation M; expressed in the global coordinates of the rest
-pose, the same turn is C M C⁻¹: into local coordinates, turn, and back. Now let G(parent) be the rotation that takes the
-parent from the rest pose to where it is. A child without angles of its own keeps its place relative to the parent, so
-it is taken along by G(parent); with angles, it is turned first, while still in the rest pose:
+The skeleton file describes the rest pose in global coordinates: the direction d of a bone, and its local axes, the
+columns of C (from the bone's `axis` angles). A frame holds the angles of the joint about these local axes. In local
+coordinates they form the rotation M; in the global coordinates of the rest pose, the same turn is C M C⁻¹: change to
+local coordinates, turn, and change back. Let G(parent) be the rotation that takes the parent from its rest pose to its
+current one. A child without angles of its own keeps its place relative to the parent, so G(parent) applies to it too. A
+child with angles is turned first, while still in the rest pose:
 
     G = G(parent) C M C⁻¹,      end of the bone = end of the parent + length G d.
 
-All angles zero give M = 1, hence G = 1 and the rest pose, whatever C is.
+If all angles are zero, then M = 1, G = 1, and the skeleton is in its rest pose for any C.
 
-The root is taken as the definition of the format has it: position P and orientation O of the file place the whole
-recorded motion, and a frame's translation t and rotation M are relative to that: G(root) = O M, and the root is at
-P + O t. Both are zero in the CMU database, where the root is simply at t, turned by M.
+The root follows the definition of the format: the position P and orientation O of the skeleton file place the whole
+motion, and a frame's translation t and rotation M are relative to them: G(root) = O M, and the root is at P + O t. Both
+are zero in the CMU database, where the root is at t, turned by M.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ssmail.data.mocap.acclaim import Skeleton
-from ssmail.data.mocap.motion import Motion
-
-Floats = NDArray[np.float64]
+from ssmail.data.mocap.amc import Motion
+from ssmail.data.mocap.asf import Skeleton
+from ssmail.data.trajectories import Floats
 
 
 def rotation(angles: Floats, order: str) -> Floats:
-    """(..., 3, 3) matrices of (..., 3) angles in radians about x, y, z, applied in the order given, as "zyx", about
-    fixed axes.
+    """Return the matrices (..., 3, 3) of angles (..., 3) in radians about the fixed axes x, y, z.
+
+    order: the order in which they are applied, such as "zyx".
     """
     result = np.eye(3)
     for axis in order:
@@ -39,13 +38,15 @@ def rotation(angles: Floats, order: str) -> Floats:
 
 
 def positions(skeleton: Skeleton, motion: Motion) -> Floats:
-    """(F, N, 3) global position of every joint in file units: the root, and the end of each bone."""
+    """Return the global positions (F, N, 3) of all joints in file units: the root, and the end of each bone."""
+    # the root: P + O t, and G = O M
     root = skeleton.root
     placed = rotation(np.array(root.orientation), root.axis_order)
     turns = "".join(channel[1] for channel in root.order if channel.startswith("r"))
     place = np.empty((len(motion), len(skeleton.parents), 3))
     place[:, 0] = np.array(root.position) + motion.translation @ placed.T
     turned = {0: placed @ rotation(motion.angles[:, 0], turns)}  # joint -> G, (F, 3, 3)
+    # the bones, each after its parent: G = G(parent) C M C⁻¹, end = end of the parent + length G d
     for joint in skeleton.top_down[1:]:
         bone, parent = skeleton.bones[joint - 1], skeleton.parents[joint]
         turned[joint] = turned[parent]
@@ -57,7 +58,7 @@ def positions(skeleton: Skeleton, motion: Motion) -> Floats:
 
 
 def _about(axis: str, angle: Floats) -> Floats:
-    """(..., 3, 3) rotations by (...) radians about one axis, counterclockwise when it points at the viewer."""
+    """Return rotations (..., 3, 3) by (...) radians about one axis, counterclockwise as seen from its tip."""
     matrix = np.zeros((*angle.shape, 3, 3))
     own = "xyz".index(axis)
     one, two = (own + 1) % 3, (own + 2) % 3

@@ -1,7 +1,7 @@
-"""Where the files of a subject are found: anywhere below a folder, or inside a zip file.
+"""Find and read the files of a subject, anywhere below a folder or inside a zip file.
 
-A zip file is read member by member into memory, up to a limit, and never unpacked: no name in it can lead outside, and
-none can grow without bounds.
+Members of a zip file are read into memory, up to a limit, and never unpacked: no member can write outside its folder or
+grow without bounds.
 """
 
 import os
@@ -12,80 +12,11 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from ssmail.errors import InputError
 
-LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes of a file; those of subject 35 have 7 kB and 0.5 MB
-
-
-class Source(Protocol):
-    """Files by name, to be read whole."""
-
-    @property
-    def path(self) -> Path:
-        """Where they are."""
-
-    def names(self) -> Iterable[str]:
-        """The files, by their paths relative to `path`."""
-
-    def read(self, name: str) -> bytes:
-        """The contents of a file. Raises InputError when it cannot be read or is larger than any of its kind."""
-
-
-@dataclass(frozen=True)
-class Subject:
-    """The files of one subject: names in a source."""
-
-    skeleton: str
-    trials: dict[int, str]
-
-
-@contextmanager
-def open_source(path: Path) -> Iterator[Source]:
-    """The folder or zip file at `path`. Raises InputError when it is neither, or cannot be read."""
-    if path.is_dir():
-        yield _Folder(path)
-        return
-    if not path.exists():
-        raise InputError(f"there is no {path}; --source takes a folder or a zip file with the .asf and .amc files")
-    try:
-        if not path.is_file():  # a pipe would block
-            raise zipfile.BadZipFile
-        archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        raise InputError(f"{path} is neither a folder nor a readable zip file; --source takes one of them") from None
-    with archive:
-        yield _Archive(path, archive)
-
-
-def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject:
-    """The skeleton of a subject and those of its trials that are there, by the names SUBJECT.asf and
-    SUBJECT_TRIAL.amc in upper or lower case, with or without leading zeros.
-
-    Raises InputError when there is no skeleton, and when one of these files is there twice.
-    """
-    wanted: dict[int | None, list[str]] = {trial: [] for trial in (None, *trials)}
-    for name in source.names():
-        found = re.fullmatch(
-            r"0*(\d{1,6})(?:\.asf|_0*(\d{1,6})\.amc)", name.rpartition("/")[2], re.IGNORECASE | re.ASCII
-        )
-        if found and int(found[1]) == subject:
-            wanted.get(int(found[2]) if found[2] else None, []).append(name)
-    for trial, names in wanted.items():
-        if len(names) > 1:
-            what = "the skeleton" if trial is None else f"trial {trial:02d}"
-            first, second = (shown(name) for name in sorted(names)[:2])
-            both = f"{first} and {second}" if first != second else f"{first}, twice"
-            raise InputError(f"{source.path} holds {what} of subject {subject} in {both}; leave one of them")
-    if not wanted[None]:
-        raise InputError(f"{source.path} holds no {subject:02d}.asf, the skeleton of subject {subject}; add it")
-    return Subject(wanted[None][0], {trial: names[0] for trial, names in wanted.items() if trial is not None and names})
-
-
-def shown(name: str) -> str:
-    """A name as a message shows it, on one line."""
-    return name if name.isprintable() else repr(name)
+LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes; the files of subject 35 have 7 kB and 0.5 MB
 
 
 @dataclass(frozen=True)
@@ -130,7 +61,66 @@ class _Archive:
             raise InputError(f"{label} is damaged; get the zip file again") from None
 
 
+Source = _Folder | _Archive  # `path`, the `names` of all files relative to it, and `read`, a file by its name
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The files of one subject, as names in a source."""
+
+    skeleton: str
+    trials: dict[int, str]
+
+
+@contextmanager
+def open_source(path: Path) -> Iterator[Source]:
+    """Open the folder or zip file at `path`. Raises InputError if it is neither, or cannot be read."""
+    if path.is_dir():
+        yield _Folder(path)
+        return
+    if not path.exists():
+        raise InputError(f"there is no {path}; --source takes a folder or a zip file with the .asf and .amc files")
+    try:
+        if not path.is_file():  # a pipe would block
+            raise zipfile.BadZipFile
+        archive = zipfile.ZipFile(path)
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
+        raise InputError(f"{path} is neither a folder nor a readable zip file; --source takes one of them") from None
+    with archive:
+        yield _Archive(path, archive)
+
+
+def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject:
+    """Find the skeleton of a subject and those of its trials that exist.
+
+    Files are named SUBJECT.asf and SUBJECT_TRIAL.amc, in upper or lower case, with or without leading zeros. Raises
+    InputError if there is no skeleton, or if one of these files is there twice.
+    """
+    wanted: dict[int | None, list[str]] = {trial: [] for trial in (None, *trials)}
+    for name in source.names():
+        found = re.fullmatch(
+            r"0*(\d{1,6})(?:\.asf|_0*(\d{1,6})\.amc)", name.rpartition("/")[2], re.IGNORECASE | re.ASCII
+        )
+        if found and int(found[1]) == subject:
+            wanted.get(int(found[2]) if found[2] else None, []).append(name)
+    for trial, names in wanted.items():
+        if len(names) > 1:
+            what = "the skeleton" if trial is None else f"trial {trial:02d}"
+            first, second = (shown(name) for name in sorted(names)[:2])
+            both = f"{first} and {second}" if first != second else f"{first}, twice"
+            raise InputError(f"{source.path} holds {what} of subject {subject} in {both}; leave one of them")
+    if not wanted[None]:
+        raise InputError(f"{source.path} holds no {subject:02d}.asf, the skeleton of subject {subject}; add it")
+    return Subject(wanted[None][0], {trial: names[0] for trial, names in wanted.items() if trial is not None and names})
+
+
+def shown(name: str) -> str:
+    """Format a name for a message, on one line."""
+    return name if name.isprintable() else repr(name)
+
+
 def _whole(file: IO[bytes], name: str, label: str) -> bytes:
+    """Read a file whole. Raises InputError if it is larger than LARGEST for its kind; `label` names it there."""
     largest = LARGEST[name[-4:].lower()]
     contents = file.read(largest + 1)
     if len(contents) > largest:

@@ -1,20 +1,19 @@
 """An SQLite database as a file: found, never made; opened, never upgraded; written whole or not at all."""
 
-import os
-import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from sqlalchemy import URL, Engine
 from sqlalchemy.exc import DBAPIError
 
+from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
 from ssmail.store.connection import as_url, explained, make_engine, reading, revision_of
 from ssmail.store.schema import REVISIONS
 
-SIDE_FILES = ("", "-wal", "-shm", "-journal")
-"""What SQLite appends to the name of a database for the files that belong to it."""
+SIDE_FILES = ("-wal", "-shm", "-journal")
+"""Suffixes of the files that SQLite may keep beside a database."""
 
 
 def existing(where: str | Path) -> Path:
@@ -70,45 +69,26 @@ def require_current(path: Path) -> None:
 
 @contextmanager
 def new_file(target: Path) -> Iterator[Path]:
-    """A path to write a new database to; when the block ends well the file gets the name `target`, else it goes.
+    """Yield a path to write a new database to; rename the file to `target` when the block succeeds, else delete it.
 
     A process that dies at any moment leaves no `target`, only a hidden file that ends in .partial. Raises InputError
-    when there is a `target` already, which stays as it is, or when its folder cannot be written.
+    when `target` exists (it stays as it is) or when its folder cannot be written.
     """
-    _refuse(target)
-    partial = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
+    _refuse_existing(target)
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        yield partial
-        with partial.open("rb+") as file:
-            os.fsync(file.fileno())
-        _name(partial, target)
+        with atomic_write(target, overwrite=False) as partial:
+            try:
+                yield partial
+            finally:
+                for ending in SIDE_FILES:
+                    partial.with_name(partial.name + ending).unlink(missing_ok=True)
     except OSError as error:
+        _refuse_existing(target)  # another process may have written it meanwhile
         raise InputError(f"{target} cannot be written: {error.strerror or error}; choose another place") from error
     except DBAPIError as error:
         raise explained(error.orig, str(target)) from error
-    finally:
-        remove(partial)
 
 
-def remove(path: Path) -> None:
-    """Delete a database file with the files beside it that belong to it, as far as they are there."""
-    for end in SIDE_FILES:
-        with suppress(OSError):
-            path.with_name(path.name + end).unlink()
-
-
-def _refuse(target: Path) -> None:
+def _refuse_existing(target: Path) -> None:
     if target.exists() or target.is_symlink():
         raise InputError(f"{target} exists already and is not overwritten; give the name of a new file")
-
-
-def _name(partial: Path, target: Path) -> None:
-    """Rename without overwriting: of two processes that give a file the same name, one succeeds."""
-    try:
-        os.link(partial, target)
-    except FileExistsError:
-        _refuse(target)
-    except OSError:  # a file system without links
-        _refuse(target)
-        partial.rename(target)

@@ -1,0 +1,68 @@
+"""Per-agent normalization of features, and the bounds on actions that follow from it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ssmail.config.sections import ModelSpec
+
+STD_FLOOR = 0.1  # smallest standard deviation, as a fraction of the mean over agents: noise is not blown up beyond this
+CLIP = 5.0  # standard deviations from the mean
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """Per-agent mean and standard deviation of the state features over the training set.
+
+    mean, std: (N, D), of the features as networks read them: scaled, and relative to the root where the spec says so.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    @classmethod
+    def fit(cls, states: Tensor) -> "Normalization":
+        """Fit to training states (M, T, N, D). A feature that never varies gets a standard deviation of 1."""
+        std, mean = torch.std_mean(states.double(), dim=(0, 1))
+        floored = std.maximum(STD_FLOOR * std.mean(dim=0))
+        std = torch.where(floored > 0, floored, torch.ones_like(floored))
+        return cls(mean.to(states.dtype), std.to(states.dtype))
+
+    @property
+    def velocity(self) -> "Normalization":
+        """The normalization of the velocities alone, (N, A) each."""
+        return Normalization(self.mean.chunk(2, dim=-1)[1], self.std.chunk(2, dim=-1)[1])
+
+    def normalize(self, states: Tensor) -> Tensor:
+        """Return (x - mean) / std of state features (..., N, D), clipped to +-CLIP so that single bad frames do not
+        dominate.
+        """
+        return ((states - self.mean) / self.std).clamp(-CLIP, CLIP)
+
+    def denormalize(self, normalized: Tensor) -> Tensor:
+        """Invert `normalize`, up to the clipping."""
+        return self.mean + self.std * normalized
+
+
+@dataclass(frozen=True)
+class ActionBounds:
+    """The velocities that an action can choose, in scaled units: at most `step` from the current velocity, and between
+    `low` and `high`. Each is (N, A), or a scalar for all agents.
+    """
+
+    step: Tensor
+    low: Tensor
+    high: Tensor
+
+    @classmethod
+    def of(cls, spec: ModelSpec, normalization: Normalization | None = None) -> "ActionBounds":
+        """Return the bounds of a spec, which are in scaled units or, with a normalization, in standard deviations
+        around each agent's mean velocity.
+        """
+        if normalization is None:
+            bound = torch.tensor(spec.action_bound)
+            return cls(torch.tensor(spec.action_step), -bound, bound)
+        velocity = normalization.velocity
+        margin = spec.action_bound * velocity.std
+        return cls(spec.action_step * velocity.std, velocity.mean - margin, velocity.mean + margin)

@@ -1,0 +1,84 @@
+"""Groups of stored runs, as figures draw them, and how runs are sorted into them."""
+
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from ssmail.config.experiments import to_tuples
+from ssmail.config.spec import flatten
+from ssmail.errors import InputError
+from ssmail.store import RunRow
+
+ABSENT = object()
+"""The value of a key that a spec does not have."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """The stored runs of one series, ordered by seed."""
+
+    label: str  # the method, with the spec's hash where two specs of it are drawn; of an ablation, the value
+    runs: tuple[RunRow, ...]
+    value: Any = None  # of the ablation's key
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The groups of a figure, and what a reader should know of the choice.
+
+    Methods are in the order of experiments.yaml; so are an ablation's values, unless they are numbers, which rise.
+    """
+
+    groups: tuple[Group, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def runs(self) -> tuple[RunRow, ...]:
+        """Every run, group after group."""
+        return tuple(run for group in self.groups for run in group.runs)
+
+
+def check_settled(runs: Iterable[RunRow], lacking: str) -> None:
+    """Raise InputError for a run that neither finished nor diverged; `lacking` is what it therefore does not have."""
+    for run in runs:
+        if not run.state.settled:
+            raise InputError(f"run {run.name} ({run.state}) has no {lacking}; leave it out or train it to its end.")
+
+
+def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:
+    """Raise InputError when the runs were trained on different data."""
+    hashes = sorted({run.dataset_hash for run in runs if run.dataset_hash})
+    if len(hashes) > 1:
+        names = ", ".join(value[:8] for value in hashes)
+        raise InputError(f"{figure} would mix runs on different data ({names}); name runs on one of them with --runs.")
+
+
+def by_spec(runs: Sequence[RunRow]) -> list[list[RunRow]]:
+    """Return runs of equal spec together, in the order of their first appearance."""
+    return grouped(runs, lambda run: run.spec_hash)
+
+
+def newest_of_each_seed(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:
+    """Return one run for each seed, by seed; `runs` come newest last."""
+    newest = {run.seed: run for run in runs}
+    return tuple(newest[seed] for seed in sorted(newest))
+
+
+def value_of(run: RunRow, key: str) -> Any:
+    """Return the value of a dotted key in the run's spec; ABSENT where there is none."""
+    return to_tuples(flatten(run.spec).get(key, ABSENT))
+
+
+def rest_of(run: RunRow, key: str) -> str:
+    """Return the run's spec without the key, and without nulls, which earlier versions may have had no key for."""
+    values = {name: value for name, value in flatten(run.spec).items() if name != key and value is not None}
+    return json.dumps(values, sort_keys=True)
+
+
+def grouped(runs: Sequence[RunRow], mark: Callable[[RunRow], str]) -> list[list[RunRow]]:
+    """Return runs of an equal mark together, in the order of their first appearance."""
+    found: dict[str, list[RunRow]] = {}
+    for run in runs:
+        found.setdefault(mark(run), []).append(run)
+    return list(found.values())

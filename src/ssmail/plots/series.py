@@ -1,0 +1,327 @@
+"""Which runs: the series that a figure compares, the specs that they need, and the stored runs that are drawn.
+
+A figure compares methods, or the values of one key of the spec (an ablation); `figures` in experiments.yaml says which.
+By default all series of a figure are drawn from one profile, and of each seed the newest run that finished or diverged:
+
+- Methods: the profile with the most seeds. Within it each method is drawn from one spec: the one that experiments.yaml
+  gives now, else the one with the most seeds, and the newest on a tie. Other stored specs are counted in a note.
+- An ablation: one family, that is runs whose specs differ in the ablation's key alone, whatever the values; those of
+  `ssmail ablate NAME --values ...` belong to it. It is the family that experiments.yaml gives in some profile, else the
+  one with the most values times seeds, if it has at least two values, and the newest on a tie.
+
+Explicit run ids replace this choice: all of these runs are drawn, whatever their state. Methods keep different specs
+apart as groups of their own; the runs of an ablation have to make one family.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from typing import Any, NamedTuple
+
+from ssmail.config.experiments import (
+    Ablation,
+    ablation,
+    ablation_specs,
+    build_spec,
+    display_value,
+    figure_requirements,
+)
+from ssmail.config.experiments_file import load_experiments
+from ssmail.config.spec import RunSpec, flatten
+from ssmail.errors import InputError
+from ssmail.plots import NoRuns
+from ssmail.plots.formatting import counted
+from ssmail.plots.run_groups import (
+    ABSENT,
+    Group,
+    Selection,
+    by_spec,
+    check_one_data_set,
+    grouped,
+    newest_of_each_seed,
+    rest_of,
+    value_of,
+)
+from ssmail.store import RunRow, Store
+
+
+class _Comparison(NamedTuple):
+    """What a figure compares on one environment: methods, or the values of an ablation's key."""
+
+    figure: str
+    environment: str
+    methods: tuple[str, ...]
+    ablation: Ablation | None
+
+    @classmethod
+    def of(cls, figure: str, environment: str | None = None) -> "_Comparison":
+        """Read it from experiments.yaml. Raises InputError for an unknown figure or environment."""
+        needed = figure_requirements(figure)
+        where = environment or needed.environment
+        varied = None if needed.ablation is None else ablation(needed.ablation, where)
+        return cls(figure, where, needed.methods, varied)
+
+    @property
+    def key(self) -> str | None:
+        """The key of the spec in which the runs of a family may differ."""
+        return self.ablation and self.ablation.key
+
+    def command(self, method: str, profile: str | None) -> str:
+        """The command that trains the runs: those of `method`, or all of the ablation."""
+        if self.ablation is None:
+            return train_command(method, self.environment, profile)
+        elsewhere = self.environment != ablation(self.ablation.name).environment
+        where = f" --env {self.environment}" if elsewhere else ""
+        return f"`ssmail ablate {self.ablation.name}{where} --profile {profile or 'quick'} --seeds 0-4`"
+
+
+class _Family(NamedTuple):
+    """Settled runs of one spec, or of specs that differ in the ablation's key alone."""
+
+    runs: tuple[RunRow, ...]  # newest last
+    current: bool  # whether experiments.yaml gives these specs now
+
+    @property
+    def seeds(self) -> int:
+        """How many different cells (a spec and a seed) there are."""
+        return len({(run.spec_hash, run.seed) for run in self.runs})
+
+    @property
+    def rank(self) -> tuple[bool, int, datetime]:
+        """The greater, the better for drawing."""
+        return self.current, self.seeds, self.runs[-1].started
+
+
+def figure_specs(figure: str, profile: str) -> dict[RunSpec, dict[str, Any]]:
+    """Return the spec of each series of `figure` ("fig4") in `profile`, with what tells it from the others.
+
+    That is its method and, of an ablation, the key and its value: {"method": "ssail", "curriculum.beta": 0.15}. Raises
+    InputError for an unknown figure or profile.
+    """
+    needed = _Comparison.of(figure)
+    if (varied := needed.ablation) is None:
+        return {build_spec(method, needed.environment, profile): {"method": method} for method in needed.methods}
+    specs = ablation_specs(varied.name, profile, environment=varied.environment)
+    return {spec: {"method": varied.method, varied.key: display_value(value)} for value, spec in specs.items()}
+
+
+def needed_by(figure: str) -> Callable[[RunRow], bool]:
+    """Return a test of whether `figure` needs a run: one of its methods, or of its ablation's specs in any profile.
+
+    Raises InputError for an unknown figure.
+    """
+    needed = figure_requirements(figure)
+    specs = None
+    if needed.ablation is not None:
+        specs = {spec.hash() for profile in load_experiments().profiles for spec in figure_specs(figure, profile)}
+
+    def needs(run: RunRow) -> bool:
+        fits = run.environment == needed.environment and run.method in needed.methods
+        return fits and (specs is None or run.spec_hash in specs)
+
+    return needs
+
+
+def select(
+    store: Store,
+    figure: str,
+    ids: Sequence[str] | None = None,
+    profile: str | None = None,
+    environment: str | None = None,
+) -> Selection:
+    """Return the runs that `figure` draws: those of `ids`, or the default choice among the stored ones.
+
+    `profile` (any by default) and `environment` (the figure's own by default) restrict the default choice. Raises
+    NoRuns when no run fits. Raises InputError for an unknown id, a run of another environment, runs of an ablation that
+    differ in more than its key, and runs that were trained on different data.
+    """
+    needed = _Comparison.of(figure, environment)
+    if ids:
+        chosen = _given(needed, store.runs(ids=ids))
+    elif needed.ablation is None:
+        chosen = _default_methods(store, needed, profile)
+    else:
+        chosen = _default_family(store, needed, needed.ablation, profile)
+    check_one_data_set(figure, chosen.runs)
+    return chosen
+
+
+def figure_ablation(figure: str) -> Ablation:
+    """Return the ablation whose values `figure` compares. Raises InputError when experiments.yaml names none for it."""
+    found = _Comparison.of(figure).ablation
+    if found is None:
+        raise InputError(f"figures.{figure} of experiments.yaml names no ablation; add one, such as beta.")
+    return found
+
+
+def train_command(method: str, environment: str, profile: str | None = None) -> str:
+    """Return the command that trains runs of this method."""
+    return f"`ssmail train --method {method} --env {environment} --profile {profile or 'quick'} --seeds 0-4`"
+
+
+def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
+    """All of these runs. Raises InputError for one that the figure cannot draw beside the others."""
+    for run in runs:
+        if run.environment != needed.environment:
+            raise InputError(
+                f"run {run.name} is of {run.environment}, but {needed.figure} draws {needed.environment}; leave it out."
+            )
+    if needed.ablation is not None:
+        _check_one_family(needed.figure, needed.ablation.key, runs)
+        return Selection(_groups_of_values(needed.ablation, runs, tuple), ())
+    places = {method: place for place, method in enumerate(needed.methods)}
+    specs = sorted(by_spec(runs), key=lambda found: places.get(found[0].method, len(places)))
+    methods = [found[0].method for found in specs]
+    groups = []
+    for found in specs:
+        method = found[0].method
+        label = method if methods.count(method) == 1 else f"{method} {found[0].spec_hash[:8]}"
+        groups.append(Group(label, tuple(sorted(found, key=lambda run: run.seed))))
+    return Selection(tuple(groups), ())
+
+
+def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
+    first, known = runs[0], flatten(runs[0].spec)
+    for run in runs:
+        if value_of(run, key) is ABSENT:
+            raise InputError(f"run {run.name} ({run.method}) has no {key}, which {figure} compares; leave it out.")
+        other = flatten(run.spec)
+        differs = [name for name in known | other if name != key and known.get(name) != other.get(name)]
+        if differs:
+            raise InputError(
+                f"runs {first.name} and {run.name} differ in {differs[0]}, but {figure} compares runs that differ in "
+                f"{key} alone; leave one of them out."
+            )
+
+
+def _families(needed: _Comparison, stored: Sequence[RunRow]) -> list[_Family]:
+    """The families of the settled runs. A single spec of an ablation is none, unless experiments.yaml gives it."""
+    settled = [run for run in stored if run.state.settled]
+    if (key := needed.key) is None:
+        return [_Family(tuple(runs), _is_current(needed, runs[0])) for runs in by_spec(settled)]
+    varied = [run for run in settled if value_of(run, key) is not ABSENT]
+    found = grouped(varied, lambda run: rest_of(run, key))
+    families = [_Family(tuple(runs), _is_current(needed, runs[0])) for runs in found]
+    return [family for family in families if family.current or len(by_spec(family.runs)) > 1]
+
+
+def _is_current(needed: _Comparison, run: RunRow) -> bool:
+    """Whether experiments.yaml gives the run's spec now; an unknown profile or method counts as outdated."""
+    try:
+        if needed.ablation is None:
+            return build_spec(run.method, run.environment, run.profile).hash() == run.spec_hash
+        name, value = needed.ablation.name, value_of(run, needed.ablation.key)
+        specs = ablation_specs(name, run.profile, values=[value], environment=needed.environment)
+        return run.spec_hash in {spec.hash() for spec in specs.values()}
+    except InputError:
+        return False
+
+
+def _no_runs(store: Store, needed: _Comparison, profile: str | None, any_stored: bool) -> NoRuns:
+    """One sentence with the command that trains the runs."""
+    what = needed.methods[0] if needed.ablation is None else f"the ablation {needed.ablation.name}"
+    found = f"{store.where} holds no {'finished ' * any_stored}run of {what} on {needed.environment}"
+    found += f" of profile {profile}" if profile else ""
+    remedy = f"run {needed.command(needed.methods[0], profile)}"
+    return NoRuns(f"{needed.figure} has nothing to draw: {found}; {remedy}.")
+
+
+def _default_methods(store: Store, needed: _Comparison, profile: str | None) -> Selection:
+    where = needed.environment
+    stored = {method: store.runs(method=method, environment=where, profile=profile) for method in needed.methods}
+    families = {method: _families(needed, runs) for method, runs in stored.items()}
+    if not any(families.values()):
+        raise _no_runs(store, needed, profile, any_stored=bool(stored[needed.methods[0]]))
+    drawn_profile = profile or _fullest_profile(families)
+    groups, notes, missing = [], [], []
+    for method, found in families.items():
+        fitting = [family for family in found if family.runs[0].profile == drawn_profile]
+        if fitting:
+            best = max(fitting, key=lambda family: family.rank)
+            groups.append(Group(method, newest_of_each_seed(best.runs)))
+            notes.append(_method_note(groups[-1], best.current, stored[method]))
+        else:
+            missing.append(f"{method} is missing; run {needed.command(method, drawn_profile)}.")
+    return Selection(tuple(groups), (*notes, *missing))
+
+
+def _fullest_profile(families: Mapping[str, Sequence[_Family]]) -> str:
+    """The profile whose best specs have the most seeds over all methods; the newest on a tie."""
+
+    def fullness(profile: str) -> tuple[int, datetime]:
+        fitting = [[family for family in found if family.runs[0].profile == profile] for found in families.values()]
+        best = [max(found, key=lambda family: family.rank) for found in fitting if found]
+        return sum(family.seeds for family in best), max(family.runs[-1].started for family in best)
+
+    return max((family.runs[0].profile for found in families.values() for family in found), key=fullness)
+
+
+def _method_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
+    """Which spec is drawn, and how many other specs and unfinished runs are not."""
+    first = group.runs[0]
+    others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
+    unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
+    seeds = ", ".join(str(run.seed) for run in group.runs)
+    note = f"{group.label}: spec {first.spec_hash[:8]} (profile {first.profile}), seeds {seeds}"
+    if not current:
+        note += "; not the spec that experiments.yaml gives now"
+    if others:
+        note += f"; {counted(others, 'other stored spec')} left out (choose with --runs)"
+    if unfinished:
+        note += f"; {counted(unfinished, 'unfinished run')} left out"
+    return f"{note}."
+
+
+def _default_family(store: Store, needed: _Comparison, varied: Ablation, profile: str | None) -> Selection:
+    stored = store.runs(method=varied.method, environment=needed.environment, profile=profile)
+    families = _families(needed, stored)
+    if not families:
+        raise _no_runs(store, needed, profile, any_stored=bool(stored))
+    best = max(families, key=lambda family: family.rank)
+    groups = _groups_of_values(varied, best.runs, newest_of_each_seed)
+    seeds = sorted({run.seed for group in groups for run in group.runs})
+    drawn_profile = best.runs[0].profile
+    note = f"ablation {varied.name}: runs of {varied.method} (profile {drawn_profile}), "
+    note += f"{counted(len(groups), 'value')}, seeds {', '.join(map(str, seeds))}"
+    if not best.current:
+        note += f"; they differ in {varied.key} alone, but are not what experiments.yaml gives now"
+        return Selection(groups, (f"{note}.", *_gaps(varied, groups, seeds, None)))
+    return Selection(groups, (f"{note}.", *_gaps(varied, groups, seeds, needed.command(varied.method, drawn_profile))))
+
+
+def _groups_of_values(
+    varied: Ablation, runs: Sequence[RunRow], choose: Callable[[Sequence[RunRow]], tuple[RunRow, ...]]
+) -> tuple[Group, ...]:
+    """A group for each value: numbers rising, anything else in the order of experiments.yaml."""
+    values: dict[Any, list[RunRow]] = {}
+    for run in runs:
+        values.setdefault(value_of(run, varied.key), []).append(run)
+    order = list(varied.values)
+    if not all(isinstance(value, int | float) for value in values):
+        ranked = sorted(values, key=lambda value: order.index(value) if value in order else len(order))
+    else:
+        ranked = sorted(values)
+    return tuple(
+        Group(_value_label(value), tuple(sorted(choose(values[value]), key=lambda run: run.seed)), value)
+        for value in ranked
+    )
+
+
+def _value_label(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(display_value(value))
+
+
+def _gaps(varied: Ablation, groups: Sequence[Group], seeds: Sequence[int], command: str | None) -> list[str]:
+    """What is missing: of any value, the seeds that others have; and with a command, values of experiments.yaml."""
+    there = {group.value: {run.seed for run in group.runs} for group in groups}
+    missing = []
+    for value, found in there.items():
+        if gone := [seed for seed in seeds if seed not in found]:
+            missing.append(
+                f"{_value_label(value)} ({'seed' if len(gone) == 1 else 'seeds'} {', '.join(map(str, gone))})"
+            )
+    if command is not None:
+        missing += [_value_label(value) for value in varied.values if value not in there]
+    if not missing:
+        return []
+    remedy = f"; {command} computes what is missing" if command is not None else ""
+    return [f"missing of {varied.key}: {', '.join(missing)}{remedy}."]

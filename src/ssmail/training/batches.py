@@ -1,0 +1,84 @@
+"""Trajectories as tensors: batches of them, and the replay buffer."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssmail.data.scaling import Scaling
+from ssmail.data.trajectories import Floats, Trajectories
+
+
+@dataclass(frozen=True)
+class Batch:
+    """B scaled trajectories.
+
+    states: (B, T + 1, N, D), positions and velocities.
+    actions: (B, T, N, A), taken in states[:, :T].
+    source: (B,), the index of the expert trajectory whose start each trajectory shares.
+    """
+
+    states: Tensor
+    actions: Tensor
+    source: Tensor
+
+    @classmethod
+    def from_trajectories(cls, trajectories: Trajectories, scaling: Scaling, device: torch.device) -> "Batch":
+        """Scale expert trajectories to float32 tensors. An action is the velocity of the next state."""
+        velocities = scaling.scale_velocities(trajectories.velocities)
+        states = np.concatenate([scaling.scale_positions(trajectories.positions), velocities], axis=-1)
+        return cls(
+            torch.as_tensor(states, dtype=torch.float32, device=device),
+            torch.as_tensor(velocities[:, 1:], dtype=torch.float32, device=device),
+            torch.arange(len(trajectories), device=device),
+        )
+
+    def __len__(self) -> int:
+        return self.states.shape[0]
+
+    def __getitem__(self, index: Tensor) -> "Batch":
+        return Batch(self.states[index], self.actions[index], self.source[index])
+
+    def draw(self, count: int, generator: torch.Generator) -> "Batch":
+        """Draw `count` trajectories uniformly with replacement."""
+        return self[torch.randint(len(self), (count,), generator=generator).to(self.states.device)]
+
+    @staticmethod
+    def concatenate(parts: "list[Batch]") -> "Batch":
+        """Join batches along the batch axis."""
+        return Batch(*(torch.cat([getattr(p, f) for p in parts]) for f in ("states", "actions", "source")))
+
+
+class ReplayBuffer:
+    """The last `capacity` generated trajectories."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.kept: Batch | None = None
+
+    def add(self, batch: Batch) -> None:
+        """Append a batch and drop the oldest trajectories beyond the capacity."""
+        joined = batch if self.kept is None else Batch.concatenate([self.kept, batch])
+        self.kept = joined[torch.arange(max(len(joined) - self.capacity, 0), len(joined))]
+
+    def sample(self, count: int, generator: torch.Generator) -> Batch:
+        """Draw `count` trajectories uniformly with replacement. Raises ValueError if the buffer is empty."""
+        if self.kept is None:
+            raise ValueError("the replay buffer is empty")
+        return self.kept.draw(count, generator)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the stored trajectories."""
+        return {} if self.kept is None else dict(vars(self.kept))
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Inverse of `state_dict`."""
+        self.kept = Batch(**state) if state else None
+
+
+def to_numpy(tensor: Tensor) -> Floats:
+    """Return the values as a float64 array in main memory."""
+    array: Floats = tensor.double().cpu().numpy()
+    return array

@@ -1,0 +1,95 @@
+"""The interfaces between the training loop and a method: a Learner trains, its Predictor is evaluated."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from ssmail.config.spec import RunSpec
+from ssmail.envs.integrator import Integrator
+from ssmail.training.batches import Batch
+from ssmail.training.seeding import Generators
+
+
+@dataclass(frozen=True)
+class LearnerContext:
+    """Everything that a learner is built from. `experts` holds the training split, scaled, on the learner's device."""
+
+    spec: RunSpec
+    experts: Batch
+    integrator: Integrator
+    generators: Generators
+
+    @property
+    def device(self) -> torch.device:
+        """The device of all tensors."""
+        return self.experts.states.device
+
+    @property
+    def steps(self) -> int:
+        """The number of actions in a training trajectory."""
+        return self.experts.actions.shape[1]
+
+
+class Predictor(Protocol):
+    """Predicts trajectories in scaled units with its model's current weights."""
+
+    @property
+    def model(self) -> nn.Module:
+        """The network whose weights the loop keeps for the best epoch."""
+        ...
+
+    def free_run(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Tensor:
+        """Predict `steps` states from the `observed` ones (B, H, N, D), feeding each prediction back as input.
+
+        Returns (B, steps + 1, N, D): the last observed state and the predictions. `noise` (B, H + steps - 1, N, D) is
+        added to every state that the predictor reads. `deterministic` replaces sampled actions by their means.
+        """
+        ...
+
+    def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
+        """Predict the mean of states[:, 1:] from states (B, T + 1, N, D), each from its true past: (B, T, N, D)."""
+        ...
+
+
+class Stateful(Protocol):
+    """Anything that a checkpoint saves: networks, optimizers, buffers."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state as tensors and plain data."""
+        ...
+
+    def load_state_dict(self, state: Any, /) -> object:
+        """Inverse of `state_dict`."""
+        ...
+
+
+class Learner(Protocol):
+    """One method in training."""
+
+    @property
+    def predictor(self) -> Predictor:
+        """The predictor to evaluate, with the current weights."""
+        ...
+
+    def networks(self) -> Iterable[nn.Module]:
+        """Return all trained networks. A weight that is not finite ends the run as diverged."""
+        ...
+
+    def run_epoch(self, epoch: int) -> dict[str, float]:
+        """Train for epoch 0 .. epochs - 1 and return its metrics."""
+        ...
+
+    def parts(self) -> Mapping[str, Stateful]:
+        """Return everything that an epoch changes, except the generators, under its name in a checkpoint."""
+        ...

@@ -1,0 +1,68 @@
+"""How long cells take."""
+
+import dataclasses
+import json
+
+import pytest
+
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
+from ssmail.execution.cells import Cell
+from ssmail.execution.durations import estimated_seconds, longest_first, total_seconds
+from ssmail.store import RunRow, Store
+
+
+def smoke(*overrides: str, method: str = "ssail") -> RunSpec:
+    return build_spec(method, "yjunction", "smoke", overrides)
+
+
+@pytest.fixture
+def row(store: Store) -> RunRow:
+    """Of a run of profile smoke."""
+    store.start_run(smoke(), 0, dataset_hash=None, device="cpu")
+    return store.runs()[0]
+
+
+def took(row: RunRow, spec: RunSpec, seconds: float) -> RunRow:
+    """The row as it is after so many seconds of the spec."""
+    values = {"method": spec.method, "profile": spec.profile, "spec_json": spec.as_json(), "spec_hash": spec.hash()}
+    return dataclasses.replace(row, wall_seconds=seconds, **values)
+
+
+def test_runs_of_the_spec_itself_tell_the_time(row: RunRow) -> None:
+    spec, other = smoke(), smoke("training.epochs=30")
+    runs = [took(row, spec, seconds) for seconds in (10.0, 40.0, 12.0)] + [took(row, other, 1e6)]
+    assert estimated_seconds(runs, [spec]) == {spec: 12.0}
+
+
+def test_other_runs_of_the_method_are_scaled_by_their_updates(row: RunRow) -> None:
+    spec = smoke("training.epochs=30", "training.updates=20")  # 600 updates
+    ten, twenty = smoke("training.epochs=5", "training.updates=2"), smoke("training.epochs=20", "training.updates=1")
+    runs = [took(row, ten, 20.0), took(row, twenty, 80.0), took(row, twenty, 60.0)]  # 2, 4 and 3 seconds each
+    assert estimated_seconds(runs, [spec]) == {spec: 1800.0}
+    strangers = [took(row, ten.model_copy(update={"profile": "quick"}), 1.0), took(row, smoke(method="gail"), 1.0)]
+    assert estimated_seconds([*runs, *strangers], [spec]) == {spec: 1800.0}
+    assert estimated_seconds(strangers, [spec]) == {spec: None}
+
+
+def test_references_take_no_updates(row: RunRow) -> None:
+    reference, trained = smoke(method="copy-last"), smoke()
+    assert json.loads(reference.as_json())["training"] is None
+    known = estimated_seconds([took(row, reference, 2.0)], [reference, trained])
+    assert known == {reference: 2.0, trained: None}
+
+
+@pytest.mark.parametrize(
+    ("each", "jobs", "seconds"),
+    [([], 2, 0), ([4, 2, 2], 1, 8), ([4, 2, 2], 2, 4), ([6, 2, 2], 2, 6), ([4, 2], 8, 4)],
+)
+def test_runs_side_by_side_take_no_less_than_the_longest(each: list[float], jobs: int, seconds: float) -> None:
+    assert total_seconds(each, jobs) == seconds
+
+
+def test_long_and_unknown_cells_come_first() -> None:
+    short, long, unknown, vast = (smoke(f"training.epochs={epochs}") for epochs in (1, 2, 3, 4))
+    cells = [Cell(spec, seed) for spec in (short, unknown, long, vast) for seed in (1, 0)]
+    ordered = longest_first(cells, {short: 1.0, long: 2.0, unknown: None, vast: None})
+    assert [cell.spec.epochs for cell in ordered] == [4, 4, 3, 3, 2, 2, 1, 1]
+    assert [cell.seed for cell in ordered] == [1, 0] * 4

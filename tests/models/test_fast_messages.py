@@ -1,0 +1,120 @@
+"""EdgeLayers in chunks against the same layers written as one operation after the other, and both LSTMs in one
+function against two of torch's.
+"""
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from ssmail.models import fast_messages
+from ssmail.models.fast_messages import ELU, RELU, TANH, Activation, EdgeLayers, both_ways, chunks
+
+B, T, N, H, D = 3, 5, 4, 6, 2
+
+
+@pytest.fixture(params=[1, 100, 1000, 10**6])
+def chunk_size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> int:
+    """Steps one by one, a few of a trajectory with a shorter last chunk, whole trajectories, and all at once."""
+    monkeypatch.setattr(fast_messages, "CHUNK", request.param)
+    return int(request.param)
+
+
+def plain(
+    s: Tensor, r: Tensor, edges: Tensor | None, edge_weight: Tensor | None, weight: Tensor, bias: Tensor,
+    weights: Tensor | None, activation: Activation,
+) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+    act = activation.plain
+    index = torch.tensor([[i for i in range(N) if i != j] for j in range(N)])
+    first = s[:, :, index] + r.unsqueeze(-2)
+    if edges is not None and edge_weight is not None:
+        first = first + edges @ edge_weight.t()
+    second = act(act(first) @ weight.t() + bias)
+    share = torch.full((N, N - 1), 1 / (N - 1), dtype=s.dtype) if weights is None else weights
+    return second, (second * share.unsqueeze(-1)).sum(dim=-2), second.flatten(0, -2).var(dim=0, correction=0)
+
+
+def arguments(skip: bool, weighted: bool) -> list[Tensor | None]:
+    torch.manual_seed(0)
+    shapes = [(B, T, N, H), (B, T, N, H), (B, T, N, N - 1, D) if skip else None, (H, D) if skip else None, (H, H), (H,),
+              (B, T, N, N - 1) if weighted else None]  # fmt: skip
+    return [None if shape is None else torch.randn(shape, dtype=torch.float64).requires_grad_() for shape in shapes]
+
+
+@pytest.mark.parametrize("activation", [ELU, TANH, RELU])
+@pytest.mark.parametrize(("skip", "weighted"), [(False, False), (True, False), (False, True)])
+def test_values_and_gradients(chunk_size: int, activation: Activation, skip: bool, weighted: bool) -> None:
+    given = arguments(skip, weighted)
+    results = []
+    for function in (EdgeLayers.apply, plain):
+        second, received, variance = function(*given, activation)
+        total = (second.sum(dim=1).sin().sum() if not weighted else 0) + received.cos().sum()
+        total = total + (variance.sin().sum() if not weighted else 0)
+        leaves = [g for g in given if g is not None]
+        results.append([second, received, *torch.autograd.grad(total, leaves), *([] if weighted else [variance])])
+    for ours, theirs in zip(*results, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12)
+
+
+def test_chunks_cover_everything_once(chunk_size: int) -> None:
+    count = torch.zeros(B, T)
+    for chunk in chunks(B, T, N * (N - 1) * H):
+        count[chunk] += 1
+    assert bool((count == 1).all())
+
+
+def test_the_variance_of_large_values_is_not_lost_to_rounding() -> None:
+    """A feature of mean 1000 and spread 1, in single precision."""
+    torch.manual_seed(0)
+    s, bias, weight = torch.rand(8, 4, N, 1), torch.tensor([1000.0]), torch.ones(1, 1)
+    second, _, variance = EdgeLayers.apply(s, torch.zeros_like(s), None, None, weight, bias, None, RELU)
+    exact = second.double().flatten(0, -2).var(dim=0, correction=0)
+    torch.testing.assert_close(variance.double(), exact, rtol=1e-3, atol=0)
+    naive = second.square().mean(dim=(0, 1, 2, 3)) - second.mean(dim=(0, 1, 2, 3)).square()  # negative control
+    assert float((naive / exact - 1).abs()) > 1e-2
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_faster_activations(dtype: torch.dtype) -> None:
+    x = torch.linspace(-120, 120, 40001, dtype=dtype)
+    for activation in (ELU, TANH):
+        torch.testing.assert_close(
+            activation.in_place(x.clone()),
+            activation.plain(x),
+            rtol=1e-6,
+            atol=2e-7 if dtype == torch.float32 else 1e-15,
+        )
+
+
+def lstm_results(past: nn.LSTM, future: nn.LSTM, x: Tensor, scale: Tensor, shift: Tensor, ours: bool) -> list[Tensor]:
+    """The hidden states, and the gradients of a function of them."""
+    leaves = [x, scale, shift, *past.parameters(), *future.parameters()]
+    if ours:
+        first, both = both_ways(x, past, future, scale, shift)
+    else:
+        read = scale * x + shift
+        first = past(read)[0]
+        both = torch.cat([first, future(read.flip(0))[0].flip(0)], dim=-1)
+    mixed = first.cos().sum() + (both * torch.linspace(1, 2, both.numel()).view(both.shape)).sin().sum()
+    return [first, both, *torch.autograd.grad(mixed, leaves)]
+
+
+@pytest.mark.parametrize("by_torch", [True, False])
+@pytest.mark.parametrize("steps", [1, 2, 7])
+def test_lstms_both_ways(by_torch: bool, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fast_messages, "ONE_BY_ONE_UP_TO", 10**9 if by_torch else 0)
+    torch.manual_seed(0)
+    past, future = nn.LSTM(4, 3).double(), nn.LSTM(4, 3).double()
+    x, scale, shift = (
+        torch.randn(shape, dtype=torch.float64).requires_grad_() for shape in ((steps, 6, 4), (4,), (4,))
+    )
+    ours, theirs = (lstm_results(past, future, x, scale, shift, ours) for ours in (True, False))
+    for mine, other in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-12)
+    exchanged = lstm_results(future, past, x, scale, shift, ours=True)  # negative control
+    assert not torch.allclose(exchanged[1], theirs[1])
+
+
+def test_without_edges_there_is_nothing_to_remember() -> None:
+    past, future = nn.LSTM(4, 3), nn.LSTM(4, 3)
+    first, both = both_ways(torch.zeros(5, 0, 4), past, future, torch.ones(4), torch.zeros(4))
+    assert (first.shape, both.shape) == ((5, 0, 3), (5, 0, 6))
