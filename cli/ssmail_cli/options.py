@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ssmail.errors import InputError, SsmailError, unknown_name
+from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail_cli.output import Format
 
@@ -19,14 +20,6 @@ DEFAULT_DATABASE = "results/ssmail.db"
 DEFAULT_OUT = Path("results/figures")
 DEFAULT_FORMATS = ["png"]
 MOST_SEEDS = 1000
-
-
-class ResumeChoice(StrEnum):
-    """What to do with an unfinished run of the same spec and seed."""
-
-    AUTO = "auto"
-    NEVER = "never"
-    REQUIRE = "require"
 
 
 class Device(StrEnum):
@@ -87,7 +80,7 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the spec: sac.gamma=0.9; repeatable."),
 ]
 ResumeOption = Annotated[
-    ResumeChoice,
+    Resume,
     typer.Option("--resume", help="Continue an unfinished run: if there is one, never, or fail without one."),
 ]
 DeviceOption = Annotated[Device, typer.Option("--device", help="auto takes a GPU when there is one.")]
@@ -122,13 +115,13 @@ def open_store(database: str) -> "Store":
 
     Raises InputError when the file is missing: reading must not make one.
     """
-    from ssmail.store import STALE_SECONDS, Store, is_alive
+    from ssmail.store import Store
 
     if is_missing(database):
         command = "ssmail train --method ssail --profile quick --seeds 0-4"
         raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
     store = Store.open(database)
-    if not all(is_alive(row, STALE_SECONDS) for row in store.runs(state="running")):
+    if not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()
     return store

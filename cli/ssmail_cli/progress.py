@@ -11,7 +11,7 @@ from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from ssmail.execution.local import Cell, Event
+    from ssmail.execution.cells import Cell, Event
 
 Sweep = Mapping["Cell", Mapping[str, Any]]  # what tells each cell from the others; see sweep.py
 Report = Callable[["Event"], None]

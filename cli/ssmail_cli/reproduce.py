@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from ssmail.errors import ExitCode, InputError, unknown_name
+from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import options
 from ssmail_cli.datasets import prep_mocap
-from ssmail_cli.options import Device, ResumeChoice, is_missing, parse_seeds
+from ssmail_cli.options import Device, is_missing, parse_seeds
 from ssmail_cli.output import chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
@@ -22,7 +23,7 @@ from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result
 if TYPE_CHECKING:
     from ssmail.config.spec import RunSpec
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
     from ssmail.paper.report.drawing import Drawn
     from ssmail.store import RunRow, Store
 
@@ -111,7 +112,7 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
 
 def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
     """Return the cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
     from ssmail.plots.series import figure_specs
 
     return {
@@ -189,8 +190,7 @@ def _train(
     figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, the longest first. Raises typer.Exit when interrupted."""
-    from ssmail.execution.cells import check_labels
-    from ssmail.execution.durations import longest_first
+    from ssmail.execution.planning import check_labels, longest_first
     from ssmail.store import Store
 
     needed = _trainable(figures, data)
@@ -199,7 +199,7 @@ def _train(
     _make_data(figures, data, cmu)
     store = Store.open(db)
     _wait_for_others(store, sweep)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, ResumeChoice.AUTO, device))
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
     if is_interrupted(rows):
         finish(sweep, rows)
     return store, sweep, rows
@@ -207,7 +207,7 @@ def _train(
 
 def _wait_for_others(store: "Store", sweep: Sweep) -> None:
     """Wait for the processes of a reproduction that was killed a moment ago to end."""
-    from ssmail.execution.waiting import wait_for_others
+    from ssmail.execution.local import wait_for_others
 
     def on_wait(run: "RunRow") -> None:
         note(f"waiting up to half a minute for another process, running or recently killed, to release run {run.name}")
@@ -231,7 +231,7 @@ def _stored_runs(store: "Store", sweep: Sweep) -> "dict[Cell, str]":
 
 def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
     """Estimate from the stored runs how long a run of each spec takes."""
-    from ssmail.execution.durations import estimated_seconds
+    from ssmail.execution.planning import estimated_seconds
     from ssmail.store import Store
 
     runs = [] if is_missing(db) else Store.open(db).runs(state="finished")
@@ -261,12 +261,12 @@ def _stored_cells(sweep: Sweep, data: _Data, db: str) -> "set[Cell]":
         return set()
     if data.made or data.missing:
         return set(_stored_runs(Store.open(db), sweep))
-    return {cell for cell, (action, _) in plan(sweep, db, ResumeChoice.AUTO).items() if action == "skip"}
+    return {cell for cell, (action, _) in plan(sweep, db, Resume.AUTO).items() if action == "skip"}
 
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     """Estimate the time of runs that take these seconds (None: unknown), `jobs` at once; as a number and in words."""
-    from ssmail.execution.durations import total_seconds
+    from ssmail.execution.planning import total_seconds
 
     known = [value for value in each if value is not None]
     total = total_seconds(known, jobs)

@@ -7,9 +7,10 @@ from typing import Annotated, Any
 import typer
 
 from ssmail.errors import InputError
+from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
-from ssmail_cli.options import Device, ResumeChoice, parse_seeds, pick_device
+from ssmail_cli.options import Device, parse_seeds, pick_device
 from ssmail_cli.output import note
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
 
@@ -34,7 +35,7 @@ def train(
     seeds: options.Seeds = "0",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
-    resume: options.ResumeOption = ResumeChoice.AUTO,
+    resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
@@ -45,7 +46,7 @@ def train(
     A spec and a seed make a run: finished runs are skipped, unfinished ones resumed. Ctrl-C saves and stops.
     """
     from ssmail.config.experiments import build_spec
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
     spec = build_spec(method, environment, profile, settings or [])
@@ -66,7 +67,7 @@ def ablate(
     seeds: options.Seeds = "0-4",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
-    resume: options.ResumeOption = ResumeChoice.AUTO,
+    resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
@@ -78,7 +79,7 @@ def ablate(
     ablations are entries of experiments.yaml; `ssmail ablate-beta` is short for `ssmail ablate beta`.
     """
     from ssmail.config.experiments import ablation, ablation_specs, display_value
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
     column = _column(ablation(name, environment).key)
@@ -106,7 +107,7 @@ def ablate_alias(
     seeds: options.Seeds = "0-4",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
-    resume: options.ResumeOption = ResumeChoice.AUTO,
+    resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
