@@ -14,8 +14,7 @@ import torch
 from ssmail.errors import InputError, SsmailError
 from ssmail.execution.cells import BEST, LAST, Cell, Event, Plan, Resume, Settings, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
-from ssmail.training.loop import Divergence
+from ssmail.training.loop import Divergence, load_checkpoint, save_checkpoint
 
 
 def run_cell(

@@ -20,10 +20,8 @@ from ssmail.evaluation.metrics import (
     one_step_mse,
 )
 from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
-from ssmail.training.batches import Batch, to_numpy
+from ssmail.training.batches import Arrays, Batch, to_numpy
 from ssmail.training.learner import LearnerContext, Predictor
-
-Arrays = dict[str, np.ndarray]
 
 
 class Evaluator(ABC):

@@ -15,7 +15,7 @@ from ssmail.evaluation.landscape import Plane, closeness, mean_cosine, nearest_p
 from ssmail.losses.self_supervision import mix, nearest
 from ssmail.models.features import Features
 from ssmail.training.adversarial import AdversarialLearner
-from ssmail.training.batches import to_numpy
+from ssmail.training.batches import Arrays, to_numpy
 from ssmail.training.learner import Learner, LearnerContext
 
 REFERENCES = 2  # training trajectories that supply everything but the agent's position at a point of the plane
@@ -25,8 +25,6 @@ ROLLOUTS = 8  # current trajectories, from training starts
 CURRENT = 0.5  # the fraction of all epochs after which the policy is "the current one" of Figure 2
 ALPHAS_BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # of points behind the current trajectory
 ALPHAS_AHEAD = tuple(a / 8 for a in range(8))  # of points on the current trajectory and ahead of it
-
-Arrays = dict[str, np.ndarray]
 
 
 def landscape_epochs(spec: RunSpec) -> tuple[int, ...]:
