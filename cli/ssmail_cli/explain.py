@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ssmail.plots.formatting import short_code
 from ssmail_cli import options
 from ssmail_cli.display import Format, chosen_format, note, print_rows, short, write_json
 
@@ -104,19 +105,12 @@ def _rows(found: "Explanation", agreement: "Agreement | None") -> list[dict[str,
                 for key, value in source.differs.get(run.spec_hash, {}).items()
             ),
             "data": (run.dataset_hash or "")[:8],
-            "code": _short_code(run.code),
+            "code": short_code(run.code),
             "database": states.get(run.id),
         }
         for run in source.runs
     ]
     return rows or [{"run": run_id[:8], "database": states.get(run_id)} for run_id in source.run_ids]
-
-
-def _short_code(code: str) -> str:
-    """ "0.1.0+703fd585", with "-dirty" where it stands."""
-    version, plus, commit = code.partition("+")
-    dirty = "-dirty" if commit.endswith("-dirty") else ""
-    return f"{version}{plus}{commit[:8]}{dirty}"
 
 
 def _as_json(found: "Explanation", agreement: "Agreement | None") -> dict[str, Any]:

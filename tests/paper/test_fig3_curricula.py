@@ -78,5 +78,5 @@ def same(line: Line2D, rows: pd.DataFrame) -> bool:
 def test_a_run_without_segment_lengths_is_refused(store: Store, add_run: Any) -> None:
     spec = ablation_specs("curriculum", "smoke")["teacher-forcing"]
     run = add_run(0, state=RunState.INTERRUPTED, spec=spec)
-    with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no curriculum/segment_length; "):
+    with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no curriculum/segment_length yet; "):
         fig3_curricula.collect(store, [run])

@@ -75,14 +75,9 @@ def letter_lines(params: LettersSpec) -> Floats:
     """Return the letters as drawn without jitter, (N, POINTS, 2), at equal distances along the line."""
     fine = np.linspace(_lead(params.steps) * (1 - REST / 2), params.steps - 1, 2000)
     drawn = _positions(params, fine[None], _still(params, 1))[0]  # (2000, N, 2)
-    lines = np.moveaxis(drawn, 1, 0)
-    return np.stack([_evenly(line) for line in lines])
-
-
-def _evenly(line: Floats) -> Floats:
-    """Return POINTS points at equal distances along a polyline (P, 2)."""
-    lengths = arc_lengths(line)
-    return along(line, lengths, np.linspace(0.0, lengths[-1], POINTS))
+    lengths = [arc_lengths(line) for line in np.moveaxis(drawn, 1, 0)]
+    evenly = [along(drawn[:, n], measure, np.linspace(0.0, measure[-1], POINTS)) for n, measure in enumerate(lengths)]
+    return np.stack(evenly)
 
 
 def _lead(steps: int) -> float:

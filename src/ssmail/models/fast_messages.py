@@ -71,13 +71,13 @@ def sum_over_senders(s: Tensor, r: Tensor, w: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Activation:
-    """An activation in its plain form and, for EdgeLayers, in place.
+    """An activation as a plain function and, for EdgeLayers, in place.
 
     gradient: maps the gradient of the result, and the result, to the gradient of the argument.
     """
 
     plain: Callable[[Tensor], Tensor]
-    apply: Callable[[Tensor], Tensor]
+    in_place: Callable[[Tensor], Tensor]
     gradient: Callable[[Tensor, Tensor], Tensor]
 
 
@@ -148,12 +148,12 @@ class EdgeLayers(torch.autograd.Function):
             if edges is not None and edge_weight is not None:
                 first.append(hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t()))
             # second layer, written into its place in `second`
-            torch.addmm(bias, activation.apply(hidden), weight.t(), out=out)
-            activation.apply(out)
+            torch.addmm(bias, activation.in_place(hidden), weight.t(), out=out)
+            activation.in_place(out)
             # sum over senders; of the plain mean also the squares, for batch norm
             if weights is None:
                 torch.mean(second[k], dim=-2, out=received[k])
-                near = out.mean(dim=0) if near is None else near  # subtracted against cancellation
+                near = out.mean(dim=0) if near is None else near  # close to the mean: avoids cancellation
                 squares += (out - near).square_().sum(dim=0)
             else:
                 torch.sum(second[k] * weights[k].unsqueeze(-1), dim=-2, out=received[k])
@@ -192,7 +192,7 @@ class EdgeLayers(torch.autograd.Function):
                 g = grad_second[k] + g
             # second layer
             g = ctx.activation.gradient(g.expand_as(m), m).flatten(0, 3)
-            hidden = ctx.activation.apply(first_layer(s[k], r[k])) if edges is None else first[number]
+            hidden = ctx.activation.in_place(first_layer(s[k], r[k])) if edges is None else first[number]
             grad_weight.addmm_(g.t(), hidden)
             grad_bias += g.sum(dim=0)
             # first layer
@@ -238,8 +238,10 @@ class BothWays(torch.autograd.Function):
             hidden = past = x.new_zeros(h, e)
             for now in order:
                 gate, cell = gates[way, now], cells[way, now]
+                # gates: s(W_x x + W_h h + b)
                 torch.addmm(added, scaled_input, x[now].t(), out=gate)
                 i, f, g, o = gate.addmm_(scaled_hidden, hidden).sigmoid_().chunk(4)
+                # cell and hidden state
                 torch.mul(i, g.mul_(2).sub_(1), out=cell).addcmul_(f, past)
                 hidden, past = tanh_(cell.clone()).mul_(o), cell
                 out[now, :, way * h : (way + 1) * h] = hidden.t()
@@ -259,11 +261,14 @@ class BothWays(torch.autograd.Function):
             grad_cell = torch.zeros_like(cells[0, 0])
             for place in range(t - 1, -1, -1):
                 now, before = order[place], order[place - 1] if place else None
+                # gradient of the hidden state: from the output, and from the gates of the next step
                 grad_hidden = grad_out[now, :, way * h : (way + 1) * h].t().contiguous()
                 if place < t - 1:
                     grad_hidden.addmm_(w_hidden[way].t(), change)
+                # gradients of the gates, which `change` then holds, and of the past cell
                 past = None if before is None else cells[way, before]
                 grad_cell = gate_gradients(change, gates[way, now], cells[way, now], past, grad_hidden, grad_cell)
+                # gradients of the weights and of x, to which both directions add
                 grad_w_input[way].addmm_(change, x[now])
                 grad_bias[way] += change.sum(dim=1)
                 if before is not None:

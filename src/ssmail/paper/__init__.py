@@ -1,1 +1,1 @@
-"""The paper's results: a module for each figure with the claim that is read off it, and the report of all."""
+"""The results of the paper: one module for each figure with the claim that is read off it, and the report on all."""

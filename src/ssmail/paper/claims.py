@@ -1,4 +1,4 @@
-"""What a claim, a part of it and a verdict are, and how the parts make the verdict of the claim."""
+"""Claims, the samples and tested parts that decide them, and the verdict that follows from the parts."""
 
 import math
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from ssmail.evaluation.hypothesis_tests import ALPHA, Estimate
 
 
 class Verdict(StrEnum):
-    """What the runs say of a statement."""
+    """What the runs say about a claim or a part of it."""
 
     SUPPORTED = "supported"
     CONTRADICTED = "contradicted"
@@ -22,14 +22,14 @@ class Claim:
 
     name: str  # "C1"
     alias: str
-    sentence: str  # the paper's, in our own short words
-    section: str  # where it stands
+    sentence: str  # a short paraphrase of the paper
+    section: str
     figure: str  # whose runs decide it, in experiments.yaml
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One number of every run of a group, by seed. +-inf: diverged, the worst there is; NaN: unknown."""
+    """One number per run of a group, by seed. +-inf: diverged, the worst there is; NaN: unknown."""
 
     label: str
     seeds: tuple[int, ...] = ()
@@ -44,22 +44,22 @@ class Sample:
 
 @dataclass(frozen=True)
 class Part:
-    """A statement that one test decides."""
+    """A statement that one hypothesis test decides."""
 
     statement: str
-    statistic: str  # the number of a run
+    statistic: str  # the number that is computed from each run
     test: str
     samples: tuple[Sample, ...]
     effect: Estimate
-    effect_is: str
-    p_for: float  # one-sided, that the data look so much in favour although the statement is false; 1 without data
-    p_against: float  # likewise against
+    effect_is: str  # what the effect is
+    p_for: float  # one-sided p of the test in favour of the statement; 1 without data
+    p_against: float  # one-sided p of the opposite test; 1 without data
     reason: str = ""  # why nothing could be tested
-    seeds: int | None = None  # that a test would need in each group, by the stated power calculation; None: no number
+    seeds: int | None = None  # seeds per group that the power calculation asks for; None: no number would do
 
     @property
     def verdict(self) -> Verdict:
-        """By ALPHA, each direction by itself."""
+        """Each direction is tested at ALPHA."""
         if self.p_for <= ALPHA:
             return Verdict.SUPPORTED
         return Verdict.CONTRADICTED if self.p_against <= ALPHA else Verdict.INCONCLUSIVE
@@ -71,7 +71,7 @@ class Part:
 
     @property
     def more_seeds(self) -> int | None:
-        """How many more would settle it: 0 when it is settled, None when no number is expected to."""
+        """How many more seeds should settle it: 0 when it is settled, None when no number is expected to."""
         if self.verdict is not Verdict.INCONCLUSIVE:
             return 0
         return None if self.seeds is None else max(self.seeds - self.fewest, 1)
@@ -79,13 +79,13 @@ class Part:
 
 @dataclass(frozen=True)
 class Decision:
-    """What the parts say together."""
+    """The verdict on a claim, from its parts."""
 
     parts: tuple[Part, ...]
 
     @property
     def verdict(self) -> Verdict:
-        """Supported when all parts are, contradicted when any is, else inconclusive."""
+        """Supported when all parts are, contradicted when any part is, otherwise inconclusive."""
         found = {part.verdict for part in self.parts}
         if Verdict.CONTRADICTED in found:
             return Verdict.CONTRADICTED
@@ -93,36 +93,39 @@ class Decision:
 
     @property
     def p_for(self) -> float:
-        """Of all parts being true: the largest of theirs, which needs no correction (intersection-union test)."""
+        """p in favour of all parts: the largest of theirs, which needs no correction (intersection-union test)."""
         return max(part.p_for for part in self.parts)
 
     @property
     def p_against(self) -> float:
-        """Of any part being false: the smallest of theirs times their number (Bonferroni), for each had a chance."""
+        """p against any part: the smallest of theirs times the number of parts (Bonferroni)."""
         return min(1.0, len(self.parts) * min(part.p_against for part in self.parts))
 
     @property
     def p(self) -> float:
-        """Of the claim, whichever way it points."""
+        """p of the claim in the direction in which the runs point."""
         return min(self.p_for, self.p_against)
 
     @property
     def more_seeds(self) -> int | None:
-        """What the neediest part needs; 0 when the claim is settled, None when a part is not expected to be."""
+        """What the neediest part needs: 0 when the claim is settled, None when no number is expected to settle it."""
         if self.verdict is not Verdict.INCONCLUSIVE:
             return 0
         needed = [part.more_seeds for part in self.parts]
         return None if None in needed else max(number for number in needed if number is not None)
 
     def corrected(self, adjusted: float) -> Verdict:
-        """The verdict by an adjusted p of the claim (see `holm`)."""
+        """The verdict at an adjusted p of the claim (see `holm`)."""
         if adjusted > ALPHA:
             return Verdict.INCONCLUSIVE
         return Verdict.SUPPORTED if self.p_for <= self.p_against else Verdict.CONTRADICTED
 
 
 def holm(values: Sequence[float]) -> tuple[float, ...]:
-    """Holm's (1979) adjusted p of each of m values: all that are <= ALPHA may be believed together at level ALPHA."""
+    """Adjust p values by Holm's (1979) method.
+
+    Rejecting every hypothesis with an adjusted p <= ALPHA keeps the chance of any false rejection at ALPHA.
+    """
     m, adjusted, highest = len(values), [1.0] * len(values), 0.0
     for rank, index in enumerate(sorted(range(m), key=lambda i: values[i])):
         highest = max(highest, min(1.0, (m - rank) * values[index]))

@@ -1,4 +1,4 @@
-"""What a saved figure is drawn from, and whether a database still says the same."""
+"""Explain what a saved figure was drawn from, and compare it with a database."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,10 @@ ENDINGS = (".png", ".pdf", ".svg", ".gif")
 
 @dataclass(frozen=True)
 class Explanation:
-    """A figure's origin. csv: where its CSV is or was; csv_state: as written, altered, missing, or None: not known."""
+    """The origin of a figure.
+
+    csv: the path where its CSV should be. csv_state: "as written", "altered", "missing", or None if unknown.
+    """
 
     path: Path
     provenance: Provenance
@@ -31,10 +34,10 @@ class Explanation:
 
 @dataclass(frozen=True)
 class Agreement:
-    """What a database says of a figure.
+    """How a database compares with a figure.
 
-    runs: by run id "same", "missing", or what has changed. values: "same", "different", or None where they cannot be
-    compared. reason: where they differ first, or why they cannot be compared.
+    runs: by run id, "same", "missing", or what has changed. values: "same", "different", or None where they cannot be
+    compared. reason: the first difference, or why they cannot be compared.
     """
 
     where: str
@@ -44,16 +47,16 @@ class Agreement:
 
     @property
     def agrees(self) -> bool | None:
-        """Whether all runs are as they were and give the same values; None where the values cannot be compared."""
+        """Whether all runs are unchanged and yield the same values; None where the values cannot be compared."""
         if any(state != "same" for state in self.runs.values()) or self.values == "different":
             return False
         return True if self.values == "same" else None
 
 
 def explain(path: Path) -> Explanation:
-    """The origin of a figure, or of the figure that a CSV was written with.
+    """Return the origin of a figure, or of the figure that a CSV was written with.
 
-    Raises InputError for what is no figure of ssmail's, and for a CSV without its figure beside it.
+    Raises InputError for a file that is not a figure saved by ssmail, and for a CSV without its figure beside it.
     """
     if path.suffix.lower() == ".csv":
         return _of_csv(path)
@@ -63,7 +66,7 @@ def explain(path: Path) -> Explanation:
 
 
 def compare(explanation: Explanation, store: Store) -> Agreement:
-    """Whether the store holds the same runs, and whether the figure collected from them again shows the same values."""
+    """Check that the store holds the same runs, and that the figure collected from them again has the same values."""
     source = explanation.provenance
     stored = {run.id: run for run in store.runs()}
     runs = {run_id: _run_state(run_id, source.runs, stored) for run_id in source.run_ids}
@@ -108,7 +111,7 @@ def _csv_state(csv: Path, source: Provenance) -> str | None:
 
 
 def _run_state(run_id: str, sources: Sequence[RunSource], stored: dict[str, RunRow]) -> str:
-    """Whether the store has the run as it was; of an older figure's runs nothing but the id is known."""
+    """Compare the run with the store; of a run of an older figure only the id is known."""
     run = stored.get(run_id)
     if run is None:
         return "missing"
@@ -125,7 +128,7 @@ def _run_state(run_id: str, sources: Sequence[RunSource], stored: dict[str, RunR
 
 
 def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
-    """The table of the same figure, from the same runs, with the same options."""
+    """Collect the table of the same figure from the same runs, with the same options."""
     options: dict[str, Any] = dict(source.options)
     if "statistic" in options:
         options["statistic"] = Statistic(options["statistic"])
@@ -140,7 +143,7 @@ def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
 
 
 def _first_difference(explanation: Explanation, text: str) -> str:
-    """The first line that differs, where the CSV that was written with the figure is there to compare with."""
+    """The first line in which the CSV differs, if the one that was written with the figure is still there."""
     if explanation.csv_state != "as written":
         return "the CSV that was written with it is not there to say where"
     written = explanation.csv.read_bytes().decode("utf-8").splitlines()

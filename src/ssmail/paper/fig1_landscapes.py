@@ -1,16 +1,19 @@
 """Figure 1 (sections 1, A.2): the reward over the plane, ideal and as gail and ssail learn it, for the task of Fig. 1a.
 
-(a) the task: rollouts of the untrained policy and trajectories of the expert; (b) the ideal reward
-(`ssmail.evaluation.landscape.ideal_reward`); (c) gail's and (d) ssail's reward after the last epoch of training, of one
-seed each, the one with the median slope share (the lower of two).
-At each point of the plane the agent is asked whose expert comes nearest to it; docs/paper.md says what stands for the
-other coordinates. Colours go from the lowest (0) to the highest (1) reward of each panel, with contour lines at tenths.
+Panels: (a) the task, with rollouts of the untrained policy and trajectories of the expert; (b) the ideal reward
+(`ssmail.evaluation.landscape.ideal_reward`); (c) gail's and (d) ssail's reward after the last epoch of training. Of
+each method one seed is shown: the one with the median slope share (the lower of two).
 
-The numbers of every seed are in the CSV and the notes: the stored metrics `landscape/slope_share` and
-`landscape/cosine`, after the last epoch and after the one of figure 2, and the slope share with other thresholds.
+Each point of the plane shows the reward of the agent whose expert comes nearest to it; docs/paper.md explains how the
+other coordinates are chosen. Colours run from the lowest (0) to the highest (1) reward of a panel, with contour lines
+at tenths.
 
-Deviation: ssail is trained as A.2 says (alpha in [-1, 1.5], reward 0 above 1) where experiments.yaml says so for the
-environment, whichever it is.
+The CSV and the notes have the numbers of every seed: the stored metrics `landscape/slope_share` and
+`landscape/cosine`, after the last epoch and after the epoch that figure 2 shows, and the slope share at other
+thresholds.
+
+Deviation: ssail is trained as in A.2 (alpha in [-1, 1.5], reward 0 above 1) on every environment for which
+experiments.yaml sets that, not on this one alone.
 
 Claim C7: GAIL's reward is nearly flat, SS-AIL's slopes towards the expert everywhere. A slope is usable when it is at
 least a quarter of what an even rise over the plane would have (`ssmail.evaluation.landscape`); the cosine is that
@@ -55,21 +58,21 @@ EVERYWHERE = 0.9  # of the plane
 TOWARDS = 0.5  # cosine: within 60 degrees
 SHARE_STATISTIC = f"{SHARE}: share of the plane where the learned reward has a usable slope, after training"
 COSINE_STATISTIC = f"{COSINE}: mean cosine between that slope and the direction to the expert, after training"
-THRESHOLDS = (0.1, USABLE, 0.5)  # of the slope share, as fractions of the even slope; the metric has the second
+THRESHOLDS = (0.1, USABLE, 0.5)  # of the slope share, as fractions of the even slope; the stored metric uses USABLE
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The numbers of one run, epoch by epoch."""
+    """The landscape metrics of one run, epoch by epoch."""
 
     label: str
     run: RunRow
-    values: pd.DataFrame  # epoch, slope_share, cosine; rising
-    shares: tuple[float, ...]  # after the last epoch, for THRESHOLDS
+    values: pd.DataFrame  # columns run_id, step (rising), SHARE, COSINE
+    shares: tuple[float, ...]  # after the last epoch, at THRESHOLDS
 
     @property
     def last(self) -> tuple[float, float]:
-        """Slope share and cosine after the last epoch; NaN for a run that diverged before any was measured."""
+        """Slope share and cosine after the last epoch; NaN when the run diverged before they were measured."""
         if not len(self.values):
             return float("nan"), float("nan")
         row = self.values.iloc[-1]
@@ -78,7 +81,7 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A panel with a learned reward."""
+    """A panel that shows a learned reward."""
 
     label: str
     run: RunRow
@@ -88,25 +91,25 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class LandscapesRecord:
-    """Everything that figure 1 shows. Positions are in the environment's own units."""
+    """The contents of figure 1. Positions are in the environment's own units."""
 
     untrained: Floats  # (R, T, N, 2)
     ideal: Floats  # (H, W) from 0 to 1
-    shown: tuple[Shown, ...]  # gail first: in the order of the paper
+    shown: tuple[Shown, ...]  # gail first, as in the paper
     measured: tuple[Measured, ...]
     provenance: Provenance
     notes: tuple[str, ...]
 
     @property
     def landscape(self) -> Landscape:
-        """The one whose plane and expert the task and the ideal are of."""
+        """The landscape whose plane and expert are also those of the task and the ideal reward."""
         return self.shown[-1].landscape
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, slope_share, cosine, threshold, trajectory, agent, step, x, y, reward].
 
-        kind: number (of a run after an epoch), share (with a threshold, after the last epoch), untrained, expert, ideal
-        or learned (of one point of the plane).
+        kind: number (a run after an epoch), share (a run after the last epoch, at a threshold), untrained, expert, or
+        ideal and learned (one point of the plane).
         """
         parts = [_number_rows(measured) for measured in self.measured]
         parts += [landscape_grids.path_rows(self.untrained, kind="untrained", epoch=0)]
@@ -122,7 +125,7 @@ class LandscapesRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> LandscapesRecord:
-    """The runs that `ssmail.plots.series` chooses, or those of the given ids.
+    """Collect the runs that the figure draws by default, or those of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without landscapes.
     """
@@ -142,7 +145,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
 
 
 def median_of(measured: Sequence[Measured]) -> Measured:
-    """The one with the median last slope share, the lower of two; one without a number counts as the lowest."""
+    """Return the run with the median last slope share, the lower of two; a run without one counts as the lowest."""
     ranked = sorted(measured, key=lambda item: (np.nan_to_num(item.last[0], nan=-1.0), item.run.seed))
     return ranked[(len(ranked) - 1) // 2]
 
@@ -178,7 +181,7 @@ def _ideal(landscape: Landscape) -> Floats:
 
 
 def _notes(measured: Sequence[Measured], shown: Sequence[Shown]) -> list[str]:
-    """Which seed is shown, and the numbers of all."""
+    """The seed that is shown, and the numbers of all seeds."""
     notes = []
     for item in shown:
         of = [one for one in measured if one.label == item.label]
@@ -218,7 +221,7 @@ def decide(share_gail: Sample, share_ssail: Sample, cosine_ssail: Sample) -> tup
 
 
 def draw(record: LandscapesRecord) -> Figure:
-    """Panels in two columns, one scale for all colours and lengths; a colour bar and the legend below and above."""
+    """Draw panels in two columns to one scale, with a colour bar below and the legend above."""
     panels = 2 + len(record.shown)
     rows = (panels + 1) // 2
     with style.sheet():

@@ -1,16 +1,16 @@
 """Figure 2 (section 3.1.3; "Fig. 3" in its text): the gradient of the learned reward around the current trajectory,
 for the ranges that alpha is drawn from.
 
-An arrow stands at the position of tau_alpha = (1 - alpha) tau_G + alpha tau_E at some steps, for alpha from -1 to
-below 1. tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is for
-each of them the nearest training trajectory. The arrow has the direction of the gradient of an agent's reward with
-respect to its own position, at the state and the action of tau_alpha; its colour tells whether that is towards the
-position of tau_E at the same step (by less than a right angle) or away. Where nothing is left to go, or
-the gradient is nil, there is no arrow.
+Arrows start at positions of tau_alpha = (1 - alpha) tau_G + alpha tau_E at some steps, for alpha from -1 to below 1.
+tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is the training
+trajectory nearest to each of them. An arrow has the direction of the gradient of an agent's reward with respect to its
+own position, at the state and the action of tau_alpha. Its colour shows whether it points towards the position of tau_E
+at the same step (by less than a right angle) or away. There is no arrow where the expert is reached or the gradient is
+zero.
 
-A panel for each range shows one seed, the one with the median `landscape/behind_cosine` (the lower of two): the mean
-cosine between gradient and way to the expert over all points with a negative alpha, over all rollouts, steps and
-agents. The numbers of every seed are in the CSV and the notes.
+Each range has a panel with one seed: the one with the median `landscape/behind_cosine` (the lower of two), which is the
+mean cosine between the gradient and the direction to the expert over all points with negative alpha, of all rollouts,
+steps and agents. The CSV and the notes have the numbers of every seed.
 
 Claim C8: behind the current trajectory the slope of D points to the expert only if D has seen negative alpha. Behind is
 where alpha is negative: on the far side of the current trajectory, seen from the expert.
@@ -38,6 +38,7 @@ from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection
 from ssmail.plots.series import figure_ablation, select
 from ssmail.store import RunRow, RunState, Store
+from ssmail.store.comparison import latest_values
 
 NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
@@ -56,7 +57,7 @@ BEHIND_STATISTIC = (
     "after half of the epochs"
 )
 STEPS = 10  # of a trajectory, at which arrows stand
-TRAJECTORIES = 1
+TRAJECTORIES = 1  # shown
 REACH = 0.7  # how far the frame follows a policy that leaves the expert, as a share of the expert's longer side
 MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
 TOWARDS, AWAY = "#009E73", "#CC79A7"  # colours
@@ -82,13 +83,13 @@ class Field:
 
     @property
     def cosine(self) -> Floats:
-        """(A, R, T, N) between the gradient and the way to the expert."""
+        """(A, R, T, N) cosine between the gradient and the direction to the expert."""
         return cosines(self.gradient, self.expert - self.places)
 
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """The numbers of one run; NaN when it diverged before they were measured."""
+    """The cosines of one run; NaN when it diverged before they were measured."""
 
     label: str
     run: RunRow
@@ -98,18 +99,19 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class VectorFieldRecord:
-    """Everything that figure 2 shows."""
+    """The contents of figure 2."""
 
     fields: tuple[Field, ...]  # one for each range
     measured: tuple[Measured, ...]
-    spacing: float  # of the plane's grid: what is nearer to the expert than this has no arrow
+    spacing: float  # of the plane's grid: points closer to the expert than this have no arrow
     provenance: Provenance
     notes: tuple[str, ...]
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top of all that is shown but for the arrows, with a margin; of a policy that is far
-        away no more than REACH times the expert's longer side.
+        """Left, right, bottom and top of the trajectories, with a margin.
+
+        A policy that goes far away widens the frame by at most REACH times the expert's longer side.
         """
         current, expert = (
             np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in self.fields])
@@ -126,7 +128,7 @@ class VectorFieldRecord:
         """[kind, label, run_id, seed, behind_cosine, ahead_cosine, epoch, alpha, trajectory, agent, step, x, y,
         gradient_x, gradient_y, cosine].
 
-        kind: number (of a run), current, expert, or arrow (a point of tau_alpha, with the gradient per scaled unit).
+        kind: number (a run), current, expert, or arrow (a point of tau_alpha, with the gradient per scaled unit).
         """
         numbers = [("number", one.label, one.run.id, one.run.seed, one.behind, one.ahead) for one in self.measured]
         named = ["kind", "label", "run_id", "seed", "behind_cosine", "ahead_cosine"]
@@ -139,7 +141,7 @@ class VectorFieldRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> VectorFieldRecord:
-    """The runs that `ssmail.plots.series` chooses, or those of the given ids.
+    """Collect the runs that the figure draws by default, or those of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without a vector field.
     """
@@ -159,7 +161,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
 
 
 def _of_the_paper(selection: Selection) -> Selection:
-    """Without values that the ablation of experiments.yaml does not have, such as the range of Figure 1."""
+    """Leave out ranges that the ablation of experiments.yaml does not list, such as that of figure 1."""
     values = figure_ablation(NAME).values
     groups = tuple(group for group in selection.groups if group.value in values)
     others = [group.label for group in selection.groups if group.value not in values]
@@ -172,7 +174,7 @@ def _of_the_paper(selection: Selection) -> Selection:
 
 
 def median_of(measured: Sequence[Measured]) -> Measured:
-    """The one with the median behind cosine, the lower of two, among those that have a number."""
+    """Return the run with the median behind cosine, the lower of two, among the runs that have one."""
     known = [one for one in measured if np.isfinite(one.behind)]
     if not known:
         raise InputError(f"no run with alpha in {measured[0].label} has a vector field; leave them out.")
@@ -181,14 +183,12 @@ def median_of(measured: Sequence[Measured]) -> Measured:
 
 
 def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
-    latest = store.latest_metrics([run.id for run in selection.runs], names=[BEHIND, AHEAD])
-    keys = zip(latest["run_id"].tolist(), latest["name"].tolist(), strict=True)
-    values = dict(zip(keys, latest["value"].tolist(), strict=True))
+    values = latest_values(store, selection.runs, [BEHIND, AHEAD])
     found = []
     for group in selection.groups:
         for run in group.runs:
             if (run.id, BEHIND) not in values and run.state is not RunState.DIVERGED:
-                landscape_grids.stored_epochs(store, run)  # says why, where there is no landscape at all
+                landscape_grids.stored_epochs(store, run)  # raises the clearer error for a run without any landscape
                 raise InputError(f"run {run.name} ({run.state}) has no {BEHIND} yet; leave it out or train it further.")
             numbers = (values.get((run.id, name), float("nan")) for name in (BEHIND, AHEAD))
             found.append(Measured(group.label, run, *numbers))
@@ -216,7 +216,7 @@ def _notes(measured: Sequence[Measured], fields: Sequence[Field]) -> list[str]:
 
 
 def _arrows(field: Field) -> tuple[np.ndarray, ...]:
-    """Indices (A', R', T') of the points that have arrows."""
+    """Open-mesh indices (A, R', T') of the points that have arrows."""
     alphas = np.arange(len(field.alpha))
     steps = np.unique(np.linspace(0, field.current.shape[1] - 1, STEPS).round().astype(int))
     return np.ix_(alphas, np.arange(min(TRAJECTORIES, len(field.current))), steps)
@@ -256,9 +256,7 @@ def decide(positive: Sample, both: Sample) -> tuple[Part, ...]:
 
 
 def draw(record: VectorFieldRecord) -> Figure:
-    """A panel for each range, all of one frame, side by side where it is tall and else below one another; the legend
-    stands above.
-    """
+    """Draw a panel for each range, side by side if the frame is tall and otherwise stacked, with the legend above."""
     left, right, bottom, top = frame = record.frame
     beside = top - bottom > 0.8 * (right - left)
     rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)

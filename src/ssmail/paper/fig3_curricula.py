@@ -1,8 +1,9 @@
-"""Figure 3 (section 4.4): how long the segments are that a policy generates between two interventions, over epochs.
+"""Figure 3 (section 4.4): the length of the segments that a policy generates between two interventions, over epochs.
 
-For each curriculum of the ablation `curriculum` the measured mean segment length (`curriculum/segment_length`) of every
-seed, its centre and spread over all runs, and over it, dashed and black, the closed form that a run stores with the
-measurement: T / (1 + (T - 1) f) steps for T steps and the intervention probability f of the epoch.
+For each curriculum of the ablation `curriculum`, the figure shows the measured mean segment length
+(`curriculum/segment_length`) of every seed with centre and spread over all runs. Dashed black lines are the closed form
+that each run stores beside the measurement: T / (1 + (T - 1) f) steps, for T steps and the intervention probability f
+of the epoch.
 
 Claim C6 (section 3.3): trajectory forcing lengthens the segments between interventions gradually. It uses the measured
 lengths, because the closed form is the same for all seeds. Gradual is judged against scheduled sampling, which the
@@ -20,13 +21,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import LEAST, WORST, Floats, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
-from ssmail.plots.curves import Band, Curve, band, silent
+from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group
 from ssmail.plots.series import select
@@ -51,10 +51,10 @@ JUMP = f"largest rise of {MEASURED} from an epoch to the next, as a share of the
 
 @dataclass(frozen=True, eq=False)
 class CurriculaRecord:
-    """Everything that figure 3 shows; lengths in steps."""
+    """The contents of figure 3. Lengths are in steps."""
 
-    bands: tuple[Band, ...]  # one for each curriculum, measured
-    expected: tuple[Curve, ...]  # of each, the closed form, of the run with the most epochs
+    bands: tuple[Band, ...]  # measured, one for each curriculum
+    expected: tuple[Curve, ...]  # the closed form of each, from the run with the most epochs
     statistic: Statistic
     provenance: Provenance
     notes: tuple[str, ...]
@@ -76,16 +76,14 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> CurriculaRecord:
-    """The segment lengths of the runs that `ssmail.plots.series` chooses, or of the given ids.
+    """Collect the segment lengths of the runs that the figure draws by default, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run that stored no segment lengths.
     """
     selection = select(store, NAME, runs, profile)
     values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
     measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
-    for group in selection.groups:
-        for run in silent(group, measured):
-            raise InputError(f"run {run.name} ({run.state}) has no {MEASURED}; leave it out or train it again.")
+    check_recorded(selection.groups, MEASURED, measured)
     return CurriculaRecord(
         bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
         expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
@@ -96,7 +94,7 @@ def collect(
 
 
 def _longest(group: Group, expected: pd.DataFrame, statistic: Statistic) -> Curve:
-    """The closed form is the same for every seed, so that of the run with the most epochs tells it."""
+    """The closed form of the run with the most epochs; it is the same for every seed."""
     return max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
 
 
@@ -129,7 +127,7 @@ def decide(grown: Sample, jump: Sample, jump_sampling: Sample) -> tuple[Part, ..
 
 
 def draw(record: CurriculaRecord) -> Figure:
-    """The record on one pair of axes, lengths on a logarithmic scale with plain numbers; the legend stands above."""
+    """Draw all curricula on one pair of axes, lengths on a logarithmic scale, with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=2.9)
         axes = figure.add_subplot()
@@ -152,7 +150,7 @@ def draw(record: CurriculaRecord) -> Figure:
 
 
 def _length_axis(axes: Axes, record: CurriculaRecord) -> None:
-    """From 1 step, the shortest segment, to the longest there is."""
+    """Scale the axis from 1 step, the shortest possible segment, to the longest measured one."""
     top = max((float(shown.finite.max(initial=1.0)) for shown in record.bands), default=1.0)
     axes.set_yscale("log")
     axes.set_ylim(0.9, max(1.15 * top, 2))

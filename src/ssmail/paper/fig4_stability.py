@@ -1,19 +1,19 @@
 """Figure 4 (section 4.2): the training error on Y-Junction over epochs, for every seed of every adversarial method.
 
-The error is `train/mode_mse`: the position MSE, in squared scaled units, to the nearer of the expert's lanes, of
-sampled rollouts from training starts. Every method has a panel, all to one logarithmic scale. Each seed is a thin line;
-the thick line and the band are centre and spread over **all** runs of the method (`ssmail.evaluation.statistics`); the
-centres of the other methods are repeated in grey. No run is dropped: a run that diverged ends in a cross at the top
-edge, is counted in the title, and takes the mean with it. The dotted line is the test error of constant velocity: what
-driving straight on costs. The scale ends at `curves.CEILING`, where every position is as far away as a rollout that
-counts as diverged; what rises above it is told in a note.
+The error is `train/mode_mse`: the position MSE of sampled rollouts from training starts to the nearer of the expert's
+lanes, in squared scaled units. Each method has a panel, all on one logarithmic scale. Thin lines are seeds; the thick
+line and the band are centre and spread over **all** runs of the method (`ssmail.evaluation.statistics`). The centres of
+the other methods are repeated in each panel. No run is dropped: a diverged run ends in a cross at the top edge, is
+counted in the title, and leaves the mean undefined. The dotted line is the test error of constant velocity, that is of
+driving straight on. The scale ends at `curves.CEILING`, the error of a rollout whose every position is as far off as
+counts as diverged; a note reports runs that rise above it.
 
-Deviation: the paper's figure shows mean and standard deviation alone, and its authors discarded runs that failed.
+Deviation: the paper's figure shows only mean and standard deviation, and its authors discarded runs that failed.
 
-Claim C1: SS-AIL converges for every seed, GAIL and WAIL do not, and fluctuate. The paper's error is of training; a
-policy that converged has a small validation error as well, so both are asked for. "Converges to zero" becomes: a tenth
-of what driving straight on costs. "Fluctuates" is measured on the logarithm of the error, so that a method is not
-called unsteady for being worse, which other parts decide.
+Claim C1: SS-AIL converges for every seed; GAIL and WAIL do not, and fluctuate. The paper reports a training error; a
+policy that converged has a small validation error as well, so both have to be small. "Converges to zero" means: below a
+tenth of the error of constant velocity. "Fluctuates" is measured on the logarithm of the error, so that a method is not
+called unsteady only because it is worse, which other parts decide.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
 from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
-from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.series import select
 from ssmail.store import Store
@@ -57,7 +56,7 @@ FLUCTUATION = f"mean |ln(error / error of the epoch before)| of {METRIC} over th
 
 @dataclass(frozen=True, eq=False)
 class StabilityRecord:
-    """Everything that figure 4 shows."""
+    """The contents of figure 4."""
 
     bands: tuple[Band, ...]  # one for each method; squared scaled units
     statistic: Statistic
@@ -83,15 +82,13 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> StabilityRecord:
-    """The training errors of the runs that `ssmail.plots.series` chooses, or of the given ids.
+    """Collect the training errors of the runs that the figure draws by default, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without training errors.
     """
     selection = select(store, NAME, runs, profile)
     errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
-    for group in selection.groups:
-        for run in silent(group, errors):
-            raise InputError(f"run {run.name} ({run.state}) has no {METRIC} yet; leave it out or train it further.")
+    check_recorded(selection.groups, METRIC, errors)
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
     return StabilityRecord(
         bands=bands,
@@ -136,7 +133,7 @@ def decide(remaining: Sequence[Sample], fluctuations: Sequence[Sample]) -> tuple
 
 
 def draw(record: StabilityRecord) -> Figure:
-    """A panel for each method, one below the other, to one logarithmic scale. The legend stands above them."""
+    """Draw stacked panels, one for each method, on one logarithmic scale, with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=1.0 + max(1.05 * len(record.bands), 1.5))
         panels = figure.subplots(len(record.bands), 1, sharex=True, sharey=True, squeeze=False)[:, 0]

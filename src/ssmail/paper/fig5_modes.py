@@ -1,17 +1,17 @@
-"""Figure 5 (section 4.3): where a trained policy goes on Y-Junction, over the expert's two lanes, seed by seed.
+"""Figure 5 (section 4.3): where the trained policy of each seed goes on Y-Junction, drawn over the expert's two lanes.
 
-Each panel shows sampled rollouts of the best-validation model from test starts, one for each of STARTS starts spread
-over the test split and the samples in turn, with a dot where an agent ends. Grey lines are the expert's continuations
-of the same starts into both lanes. The shares in a panel are the stored test metrics, over *all* starts and samples:
-`test/on_lane` (agents that end on a lane) and `test/lane_balance` (rollouts that take the rarer lane, at most 50 %).
-A run that diverged has no test rollouts: its panel says so. A rollout that leaves the frame is cut there and counted.
-The grey lines are drawn wide, to be seen beneath the rollouts; their width means nothing.
+Each panel shows sampled rollouts of the best-validation model: one for each of STARTS starts, which are spread over the
+test split, from the samples in turn. A dot marks the end of each agent. Grey lines are the expert's continuations of
+the same starts into both lanes; they are wide only to be visible beneath the rollouts. The shares in a panel are the
+stored test metrics over *all* starts and samples: `test/on_lane` (agents that end on a lane) and `test/lane_balance`
+(rollouts that take the rarer lane, at most 50 %). The panel of a diverged run says that it has no test rollouts.
+Rollouts that leave the frame are cut there and counted.
 
-Deviation: the paper shows one trajectory set for each method; here every seed has its panel.
+Deviation: the paper shows one set of trajectories for each method; here every seed has its panel.
 
-Claim C2: SS-AIL ends on either lane, DNRI averages the lanes. To average is to end nearer to the middle between the two
-continuations of a start than to either of them. A policy that takes one lane alone does not differentiate between the
-lanes either, so both have to be used.
+Claim C2: SS-AIL ends on either lane, DNRI averages over the lanes. To average is to end nearer to the middle between
+the two continuations of a start than to either of them. A policy that always takes the same lane does not tell the
+modes apart either, so both lanes have to be used.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,6 +34,7 @@ from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
+from ssmail.store.comparison import latest_values
 
 NAME = "fig5"
 STARTS = 16
@@ -56,7 +57,7 @@ BETWEEN_STATISTIC = (
     "continuations of their start, nearer to its middle than to either end"
 )
 REACH = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
-LANE_WIDTH = 3.5  # points: the expert shows as a wide lane beneath the rollouts
+LANE_WIDTH = 3.5  # points
 
 Floats = npt.NDArray[np.floating]
 Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
@@ -64,7 +65,7 @@ Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """What one run does."""
+    """The rollouts of one run."""
 
     label: str
     run_id: str
@@ -76,10 +77,10 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class ModesRecord:
-    """Everything that figure 5 shows. Positions are in step lengths (the approach speed times one step)."""
+    """The contents of figure 5. Positions are in step lengths (the approach speed times one step)."""
 
     panels: tuple[Panel, ...]
-    expert: Floats  # (L, R, T, N, 2) the shown starts continued into each lane; empty when all runs diverged
+    expert: Floats  # (L, R, T, N, 2) continuations of the shown starts into each lane; empty when all runs diverged
     frame: Frame
     provenance: Provenance
     notes: tuple[str, ...]
@@ -96,7 +97,7 @@ class ModesRecord:
         return table.astype(dict.fromkeys(["seed", "lane", "trajectory", "agent", "step"], "Int64"))
 
     def outside(self, panel: Panel) -> int:
-        """How many of a panel's rollouts leave the frame or are not finite."""
+        """Count the panel's rollouts that leave the frame or are not finite."""
         if panel.rollouts is None:
             return 0
         x_from, x_to, y_from, y_to = self.frame
@@ -106,7 +107,7 @@ class ModesRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
-    """The test rollouts of the runs that `ssmail.plots.series` chooses, or of the given ids.
+    """Collect the test rollouts of the runs that the figure draws by default, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
     """
@@ -127,7 +128,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
 
 
 def _shown(starts: int) -> npt.NDArray[np.int64]:
-    """Indices of the shown starts, spread over all."""
+    """Indices of the starts that are shown, spread over all `starts`."""
     return np.linspace(0, starts - 1, min(STARTS, starts)).round().astype(np.int64)
 
 
@@ -136,12 +137,12 @@ def _expert(store: Store, run: RunRow) -> Floats:
 
 
 def shown_lanes(lanes: Floats) -> Floats:
-    """Of (L, B, T, N, 2), the starts that are shown: (L, R, T, N, 2). What is shown already stays as it is."""
+    """Return the shown starts (L, R, T, N, 2) of lanes (L, B, T, N, 2). Idempotent."""
     return lanes[:, _shown(lanes.shape[1])]
 
 
 def shown_rollouts(samples: Floats) -> Floats:
-    """Of (S, B, T, N, 2), the rollouts that are shown, the samples in turn: (1, R, T, N, 2); likewise."""
+    """Return the shown rollouts (1, R, T, N, 2) of samples (S, B, T, N, 2), the samples in turn. Idempotent."""
     starts = _shown(samples.shape[1])
     return samples[np.arange(len(starts)) % len(samples), starts][None]
 
@@ -150,7 +151,7 @@ THINNINGS = {LANES: shown_lanes, ROLLOUTS: shown_rollouts}
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
-    """The extent of the expert, and of the rollouts where they leave it by at most REACH of its larger side."""
+    """The extent of the expert, widened for rollouts that leave it by at most REACH of its larger side."""
     if not rollouts:
         return (0.0, 1.0, 0.0, 1.0)
     low, high = expert.min(axis=(0, 1, 2, 3)), expert.max(axis=(0, 1, 2, 3))
@@ -163,9 +164,7 @@ def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
 
 
 def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
-    metrics = store.latest_metrics([run.id for run in selection.runs], names=[ON_LANE, LANE_BALANCE])
-    keys = zip(metrics["run_id"].tolist(), metrics["name"].tolist(), strict=True)
-    values: dict[tuple[str, str], float] = dict(zip(keys, metrics["value"].tolist(), strict=True))
+    values = latest_values(store, selection.runs, [ON_LANE, LANE_BALANCE])
     return tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
 
 
@@ -177,7 +176,7 @@ def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str
 
 
 def _points(trajectories: Floats, **columns: object) -> pd.DataFrame:
-    """(R, T, N, 2) as rows of trajectory, agent, step, x, y after the constant `columns`."""
+    """Rows of trajectory, agent, step, x, y for (R, T, N, 2) positions, after the constant `columns`."""
     trajectory, step, agent = (index.ravel() for index in np.indices(trajectories.shape[:-1]))
     x, y = trajectories.reshape(-1, 2).T
     rows = {"trajectory": trajectory, "agent": agent, "step": step, "x": x, "y": y}
@@ -224,9 +223,10 @@ def decide(on_lane: Sample, balance: Sample, between: Sample) -> tuple[Part, ...
 
 
 def draw(record: ModesRecord) -> Figure:
-    """The record as panels at equal scale: two labels in a column each, any other number in turn over two columns.
+    """Draw the panels in two columns at equal scale.
 
-    A column of its own has the label above it; otherwise panels of several labels say theirs.
+    Two labels have a column each, with the label above it. Otherwise the panels fill the columns in turn; with more
+    than two labels, each panel names its own.
     """
     labels = list(dict.fromkeys(panel.label for panel in record.panels))
     cells = _cells(record.panels, labels)
@@ -254,7 +254,7 @@ def draw(record: ModesRecord) -> Figure:
 
 
 def _cells(panels: Sequence[Panel], labels: Sequence[str]) -> dict[tuple[int, int], Panel]:
-    """(row, column) of each panel."""
+    """Return the panels by (row, column)."""
     if len(labels) != 2:
         return {(i // 2, i % 2): panel for i, panel in enumerate(panels)}
     columns = [[panel for panel in panels if panel.label == label] for label in labels]
@@ -262,7 +262,7 @@ def _cells(panels: Sequence[Panel], labels: Sequence[str]) -> dict[tuple[int, in
 
 
 def _panel_height(frame: Frame) -> float:
-    """Inches that a panel of half a column's width needs for equal scales, with its gap."""
+    """The height in inches, gap included, of a panel of half a column's width at equal scales."""
     return float(np.clip(1.35 * (frame[3] - frame[2]) / (frame[1] - frame[0]), 0.6, 2.0)) + 0.15
 
 
@@ -286,6 +286,6 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
 
 
 def _draw_paths(axes: Axes, trajectories: Floats, **line: Any) -> None:
-    """(R, T, N, 2): one line for each agent of each trajectory."""
+    """Draw one line for each agent of each trajectory (R, T, N, 2)."""
     for trajectory in trajectories:
         axes.plot(trajectory[..., 0], trajectory[..., 1], solid_capstyle="round", **line)

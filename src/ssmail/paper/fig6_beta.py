@@ -1,20 +1,21 @@
 """Figure 6 (section 4.5): the test error on Y-Junction against beta, the pace of trajectory forcing.
 
-The error is `test/mode_mse` of the best-validation model: the position MSE to the nearer of the expert's lanes, squared
-scaled units, on a logarithmic scale. Below it `test/lane_balance`, the share of the rarer lane, because a policy that
-takes one lane alone can have a low error. Each seed is a point; beside them stand centre and spread over **all** runs
-of that beta (`ssmail.evaluation.statistics`). A diverged run has no test error: it counts as infinite, is a cross at
-the top edge and takes the mean with it; its lane balance is unknown, and takes the centre there with it. The values of
-beta are evenly spaced, because those of interest crowd near 0. The dotted line is constant velocity.
+The error is `test/mode_mse` of the best-validation model: the position MSE to the nearer of the expert's lanes, in
+squared scaled units, on a logarithmic scale. Below it is `test/lane_balance`, the share of the rarer lane, because a
+policy that only ever takes one lane can have a low error. Points are seeds; beside them are centre and spread over
+**all** runs of that beta (`ssmail.evaluation.statistics`). A diverged run has no test error: it counts as infinite, is
+a cross at the top edge, and leaves the mean undefined. Its lane balance is unknown, which leaves both centres
+undefined. The values of beta are evenly spaced, because those of interest crowd near 0. The dotted line is constant
+velocity.
 
-Deviation: the paper shows mean and standard deviation alone.
+Deviation: the paper shows only mean and standard deviation.
 
-Claim C3: a beta of about 15 % has a low mean and a low spread; 0 % has both high, 100 % the spread. The value 0.15 is
-the paper's and fixed beforehand, because the best of several would win by luck alone. "Considerably" is left out: any
-difference counts that cannot be chance.
+Claim C3: a beta of about 15 % has a low mean and a low spread; with 0 % both are high, with 100 % the spread is. The
+value 0.15 is the paper's and was fixed beforehand, because the best of several values would win by luck alone.
+"Considerably" is left out: any difference counts that cannot be chance.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +35,6 @@ from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group
 from ssmail.plots.series import figure_ablation, select
 from ssmail.store import Store
-from ssmail.store.comparison import latest_values
 
 NAME = "fig6"
 ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
@@ -48,8 +48,8 @@ CLAIM = Claim(
 )
 NONE, CHOSEN, COMPLETE = 0.0, 0.15, 1.0  # values of beta
 ERROR_STATISTIC = f"{ERROR} of the model of best validation, squared scaled units"
-SPREAD = 0.17  # of the distance between two values of beta: how far the points of one stand apart
-ASIDE = 0.26  # how far right of them their centre stands
+SPREAD = 0.17  # of the points of one beta, as a share of the distance between two values
+ASIDE = 0.26  # distance of the centre to the right of them, likewise
 
 POINTS, CROSSES = style.METHODS["ssail"].colour, style.METHODS["gail"].colour
 
@@ -64,18 +64,18 @@ class Column:
     seeds: tuple[int, ...]
     error: Floats  # (R,) squared scaled units; +inf when the run diverged or its error is not finite, NaN if unknown
     balance: Floats  # (R,) 0..0.5; NaN when it is unknown
-    error_summary: Summary  # each a number
+    error_summary: Summary  # of floats
     balance_summary: Summary
 
     @property
     def diverged(self) -> int:
-        """How many runs have no finite error."""
+        """The number of runs without a finite error."""
         return int(np.isposinf(self.error).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class BetaRecord:
-    """Everything that figure 6 shows."""
+    """The contents of figure 6."""
 
     columns: tuple[Column, ...]  # beta rising
     statistic: Statistic
@@ -86,8 +86,8 @@ class BetaRecord:
     def table(self) -> pd.DataFrame:
         """[kind, beta, run_id, seed, mode_mse, mode_mse_low, mode_mse_high, lane_balance, ..._low, ..._high].
 
-        kind: run, mean or median (with the ends of both spreads), or constant velocity. A diverged run has mode_mse
-        inf.
+        kind: run, mean or median (with the ends of both spreads), or constant velocity. mode_mse is inf for a diverged
+        run.
         """
         rows: list[tuple[object, ...]] = []
         nothing = (np.nan, np.nan)
@@ -109,14 +109,13 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> BetaRecord:
-    """The test results of the runs that `ssmail.plots.series` chooses, or of the given ids.
+    """Collect the test results of the runs that the figure draws by default, or of the given ids.
 
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
     """
     figure_ablation(NAME)  # without one there are no values for the axis
     selection = select(store, NAME, runs, profile)
-    values = latest_values(store, selection.runs, [ERROR, BALANCE])
-    columns = tuple(_column(group, values, statistic) for group in selection.groups)
+    columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,
         statistic=statistic,
@@ -126,15 +125,12 @@ def collect(
     )
 
 
-def _column(group: Group, values: Mapping[tuple[str, str], float], statistic: Statistic) -> Column:
+def _column(runs: Runs, group: Group, statistic: Statistic) -> Column:
     for run in group.runs:
         if not run.state.settled:
             raise InputError(f"run {run.name} ({run.state}) has no test error; leave it out or train it to its end.")
-    error, balance = (
-        np.array([values.get((run.id, name), np.nan) for run in group.runs], dtype=np.float64)
-        for name in (ERROR, BALANCE)
-    )
-    error = np.where(np.isfinite(error), error, np.inf)
+    error = np.array(runs.metric(group.value, ERROR, diverged=WORST).values)
+    balance = np.array(runs.metric(group.value, BALANCE, diverged=np.nan).values)
     return Column(
         label=group.label,
         value=group.value,
@@ -171,7 +167,7 @@ def decide(none: Sample, chosen: Sample, complete: Sample) -> tuple[Part, ...]:
 
 
 def draw(record: BetaRecord) -> Figure:
-    """The error above, the lane balance below it, over evenly spaced values of beta. The legend stands above."""
+    """Draw the error above the lane balance, over evenly spaced values of beta, with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=3.3)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
@@ -192,7 +188,7 @@ def draw(record: BetaRecord) -> Figure:
 
 
 def _short(label: str) -> str:
-    """0.05 -> .05, to fit beside its neighbours."""
+    """Shorten "0.05" to ".05", to fit beside its neighbours."""
     return label.removeprefix("0") if label.startswith("0.") else label
 
 
@@ -203,7 +199,7 @@ def _limits(record: BetaRecord) -> tuple[float, float]:
 
 
 def _places(index: int, count: int) -> Floats:
-    """Where the points of one value of beta stand, by seed, left of its centre."""
+    """The x positions of the points of one value of beta, left of its centre."""
     return index + np.linspace(-SPREAD, SPREAD, count) * (count > 1) - ASIDE / 2
 
 
@@ -215,8 +211,8 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
         points.set_gid(f"runs-{column.label}")
         if column.diverged:
             top = np.full(column.diverged, axes.get_ylim()[1])
-            style.draw_cross(axes, x[~finite], top, CROSSES).set_gid(f"diverged-{column.label}")
-    lowest = np.array([column.error.min() for column in record.columns])
+            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(f"diverged-{column.label}")
+    lowest = np.array([np.fmin.reduce(column.error) for column in record.columns])
     summary = _over_columns([column.error_summary for column in record.columns])
     line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
     line.set_label(record.statistic.words)
@@ -236,12 +232,12 @@ def _draw_balances(axes: Axes, record: BetaRecord) -> None:
 
 
 def _over_columns(summaries: Sequence[Summary]) -> Summary:
-    """Numbers for each of C columns -> three times (C,)."""
+    """Stack the summaries of C columns into one of three (C,) arrays."""
     return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:
-    """A bar from low to high for each column, where they are finite, and the centres joined by a line."""
+    """Draw a bar from low to high for each column, where they are finite, and join the centres by a line."""
     x = np.arange(len(summary.centre)) + ASIDE
     centre = np.where(np.isfinite(summary.centre), summary.centre, np.nan)
     high = np.where(np.isposinf(summary.high), axes.get_ylim()[1], summary.high)

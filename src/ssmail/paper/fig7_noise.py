@@ -1,26 +1,27 @@
 """Figure 7 (section 4.6): the error of predicted motion against the predicted step, with clean and with noisy input.
 
-The error is the array `test/mse` (clean) or `test_noisy/mse` of the best-validation model, its policy sampled: for each
-predicted step the squared error over test windows, samples, joints and all six features (position and velocity), in
-squared scaled units. The noise is Gaussian, on what the model reads at test time alone, and all runs are given the same
-draws. Each seed is a thin line; the thick line and the band are centre and spread over **all** runs of a method
-(`ssmail.evaluation.statistics`). A run that diverged has no predictions: it counts as infinite at every step, is a
-cross at the top edge, is counted in the legend, and takes the mean with it. The dotted lines are constant velocity,
+The error is the array `test/mse` (clean) or `test_noisy/mse` of the best-validation model with its policy sampled: at
+each predicted step, the mean squared error over test windows, samples, joints and all six features (position and
+velocity), in squared scaled units. Gaussian noise is added only to what the model reads at test time, with the same
+draws for all runs. Thin lines are seeds; the thick line and the band are centre and spread over **all** runs of a
+method (`ssmail.evaluation.statistics`). A diverged run has no predictions: it counts as infinite at every step, is a
+cross at the top edge, is counted in the legend, and leaves the mean undefined. The dotted lines are constant velocity,
 given the same input.
 
 The question is whether errors grow in proportion to the step, faster or slower, so the scales are linear: on a
-logarithmic one even a straight line looks as if its slope fell. Each panel has its own, from 0; it ends at REACH times
-the largest typical error (medians of the runs, and constant velocity), and runs that rise above it are told in a note.
+logarithmic scale even the slope of a straight line seems to fall. Each panel has its own scale from 0, which ends at
+REACH times the largest typical error (medians of the runs, and constant velocity). A note reports runs that rise above
+it.
 
 The slope of a curve is that of the least-squares line through the last half of its steps (25 to 48 of 48), in squared
-scaled units per step: of each run, and of a method the mean over its runs with Student's t-interval. A run without a
-finite error at all of these steps has none, and then its method has none.
+scaled units per step. It is computed for each run; a method has the mean over its runs with Student's t-interval. A run
+whose error is not finite at one of these steps has no slope, and neither has its method.
 
-Deviation: the paper shows mean and standard deviation with noise alone, and describes the slope in words.
+Deviation: the paper shows only mean and standard deviation, only with noise, and describes the slope in words.
 
 Claim C4: with noise, DNRI's error and its spread grow with the horizon, and SS-AIL's error grows ever more slowly. The
-paper does not say over what its standard deviation is taken; here it is over test windows, so that each seed has its
-own.
+paper does not say over what its standard deviation is taken; here it is taken over test windows, so that each seed has
+its own.
 """
 
 from collections.abc import Iterator, Sequence
@@ -48,7 +49,7 @@ from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig7"
-CONDITIONS = {"clean": "", "noisy": "_noisy"}  # what is told of the input -> the end of the arrays' prefixes
+CONDITIONS = {"clean": "", "noisy": "_noisy"}  # input -> suffix of the split in the names of arrays
 METRIC = "test/mse"
 CLAIM = Claim(
     name="C4",
@@ -69,31 +70,33 @@ REFERENCE_REACH = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Slopes:
-    """Of the runs of one method, squared scaled units per step."""
+    """The slopes of one method, in squared scaled units per step."""
 
-    runs: Floats  # (R,); NaN of a run that has none
-    mean: Summary  # each a number: the mean of the runs, and its interval
+    runs: Floats  # (R,); NaN where a run has none
+    mean: Summary  # floats: the mean over the runs, and its interval
 
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """What is predicted from one kind of input. Errors in squared scaled units."""
+    """The predictions from one kind of input. Errors are in squared scaled units."""
 
     condition: str  # a key of CONDITIONS
     bands: tuple[Band, ...]  # one for each method, over predicted steps
-    slopes: tuple[Slopes, ...]  # likewise
+    slopes: tuple[Slopes, ...]  # one for each method
     reference: Floats  # (T,) constant velocity; empty when no run finished
-    reference_slope: float  # NaN then
+    reference_slope: float  # NaN when no run finished
 
     @property
     def steps(self) -> int:
-        """How many are predicted; 0 when no run finished."""
+        """The number of predicted steps; 0 when no run finished."""
         return max(len(self.reference), *(len(shown.epochs) for shown in self.bands))
 
     @property
     def end(self) -> float:
-        """Where the scale ends: a little above the highest run and the reference, but within REACH times the largest
-        typical error; a reference that leaves the methods on the ground does not count.
+        """The end of the scale: just above the highest run and the reference.
+
+        It is at most REACH times the largest typical error. The reference does not count when it is so high that the
+        methods would be flat lines at the bottom.
         """
         typical, highest = [float(np.median(peaks)) for peaks in self._peaks], [max(peaks) for peaks in self._peaks]
         if not self.reference_leaves:
@@ -102,18 +105,18 @@ class Panel:
 
     @property
     def reference_leaves(self) -> bool:
-        """Whether constant velocity is so much worse than the methods that it is shown as far as the scale goes."""
+        """Whether constant velocity is so much worse than the methods that it is cut off at the end of the scale."""
         typical = max((float(np.median(peaks)) for peaks in self._peaks), default=0.0)
         return typical > 0 and max(self.reference, default=0) > REFERENCE_REACH * typical
 
     @property
     def _peaks(self) -> list[list[float]]:
-        """The highest error of each run of each method that has one."""
+        """The highest finite error of each run, by method; without methods that have none."""
         found = [[float(v.max()) for curve in shown.curves if len(v := _finite(curve))] for shown in self.bands]
         return [peaks for peaks in found if peaks]
 
     def rows(self, statistic: Statistic) -> Iterator[tuple[object, ...]]:
-        """Rows of NoiseRecord.table."""
+        """Yield the panel's rows of NoiseRecord.table."""
         nothing = (np.nan, np.nan)
         for shown, slopes in zip(self.bands, self.slopes, strict=True):
             yield from ((self.condition, *row) for row in shown.rows(statistic))
@@ -130,7 +133,7 @@ class Panel:
 
 @dataclass(frozen=True, eq=False)
 class NoiseRecord:
-    """Everything that figure 7 shows."""
+    """The contents of figure 7."""
 
     panels: tuple[Panel, ...]
     noise: float  # std, scaled units
@@ -141,8 +144,8 @@ class NoiseRecord:
     def table(self) -> pd.DataFrame:
         """[condition, kind, label, run_id, seed, step, value, low, high].
 
-        kind: run, mean or median (with the ends of the band), diverged, constant velocity; and the slopes: run slope,
-        mean slope (with its interval), constant velocity slope, at the first step of the steps that they are of.
+        kind: run, mean or median (with the ends of the band), diverged, constant velocity. Slopes have the kinds run
+        slope, mean slope (with its interval) and constant velocity slope; their step is the first that they cover.
         """
         columns = ["step" if name == "epoch" else name for name in curves.COLUMNS]
         rows = [row for panel in self.panels for row in panel.rows(self.statistic)]
@@ -156,9 +159,9 @@ def collect(
     profile: str | None = None,
     statistic: Statistic = Statistic.MEAN_STD,
 ) -> NoiseRecord:
-    """The test errors of the runs that `ssmail.plots.series` chooses, or of the given ids.
+    """Collect the test errors of the runs that the figure draws by default, or of the given ids.
 
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id, a run without test errors and runs that
+    Raises NoRuns when there is nothing to draw, InputError for an unfit id, a run without test errors, and runs that
     were tested in different ways.
     """
     selection = select(store, NAME, runs, profile)
@@ -176,7 +179,7 @@ def collect(
 
 
 def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
-    """How all of the runs are tested, as the section `forecast` of their specs says."""
+    """The section `forecast` of the specs, which states how runs are tested. Raises InputError where runs differ."""
     first = runs[0]
     for run in runs:
         if not run.state.settled:
@@ -202,7 +205,7 @@ def _panel(store: Store, selection: Selection, condition: str, statistic: Statis
 
 
 def _over_steps(errors: dict[str, Floats]) -> pd.DataFrame:
-    """Errors (T,) by run id, as Store.metrics would give them, the step being that of the prediction, from 1."""
+    """Arrange errors (T,) by run id like Store.metrics, with the predicted step, counted from 1, as the step."""
     rows = [(run, step, value) for run, values in errors.items() for step, value in enumerate(values, start=1)]
     return pd.DataFrame(rows, columns=["run_id", "step", "value"])
 
@@ -218,14 +221,14 @@ def _slopes(shown: Band) -> Slopes:
 
 
 def slope(errors: Floats) -> float:
-    """The slope per step of the least-squares line through (T,) errors; NaN of fewer than two, or where not finite."""
+    """Slope per step of the least-squares line through (T,) errors; NaN for fewer than two, or if any is not finite."""
     if len(errors) < 2 or not np.isfinite(errors).all():
         return np.nan
     return float(np.polyfit(np.arange(len(errors)), errors, deg=1)[0])
 
 
 def late_slope(errors: Floats) -> float:
-    """The slope over the last half of (T,) errors."""
+    """The `slope` of the last half of (T,) errors."""
     return slope(errors[_first_of_slope(len(errors)) - 1 :])
 
 
@@ -282,7 +285,7 @@ def decide(growth: Sample, spreading: Sample, bent: Sample, late: Sample, late_d
 
 
 def draw(record: NoiseRecord) -> Figure:
-    """Clean input above, noisy input below, each to a linear scale of its own. The legend stands above them."""
+    """Draw clean input above noisy input, each on its own linear scale, with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=3.4)
         grid = figure.subplots(len(record.panels), 1, sharex=True)
@@ -315,7 +318,7 @@ def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> l
 
 
 def _step_axis(axes: Axes, record: NoiseRecord) -> None:
-    """Its ticks are the first step, the last one, and the quarters between them."""
+    """Put ticks at the first and the last step and at the quarters between them."""
     steps = max(panel.steps for panel in record.panels)
     axes.set_xlabel("predicted step")
     axes.xaxis.set_major_locator(FixedLocator(sorted({1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))})))

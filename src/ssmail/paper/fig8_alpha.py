@@ -1,24 +1,25 @@
 """Figure 8 (section 4.7): training over epochs, for the ranges that alpha is drawn from.
 
-The paper shows a "training loss" and does not say which. Eq. 3 cannot be it as a whole: its last term asks D for labels
-that are drawn from another range, which vary by 1/12 for [0, 1] and by 1/3 for [-1, 1], so a D that has learned nothing
-of them loses by that much more. Both panels show what is the same quantity whatever alpha is drawn from:
+The paper shows a "training loss" without saying which. It cannot be all of Eq. 3: the labels of the last term are
+drawn from the range of alpha, with variance 1/12 for [0, 1] and 1/3 for [-1, 1], so a D that has learned nothing about
+them loses that much more. Both panels therefore show quantities that mean the same for every range:
 
 - above, the error of the policy on training trajectories, free-running and sampled: `train/mse`, over all predicted
-  steps and features, on mocap and letters (on Y-Junction `train/mode_mse`, to the nearer lane), squared scaled units;
-- below, the discriminator's loss on tau_G and tau_E, the first two terms of Eq. 3 without the self-supervised one:
-  `discriminator/generated` + `discriminator/expert`. It is 1/2 for a D that says 1/2 of everything and 0 for one that
-  tells the two apart for certain. D is trained on all three terms, so what it makes of these two depends on the range.
+  steps and features, on mocap and letters (on Y-Junction `train/mode_mse`, to the nearer lane), in squared scaled
+  units;
+- below, the discriminator's loss on tau_G and tau_E, that is Eq. 3 without the self-supervised term:
+  `discriminator/generated` + `discriminator/expert`. It is 1/2 for a D that outputs 1/2 everywhere and 0 for one that
+  separates the two perfectly. D is trained on all three terms, so its loss on these two still depends on the range.
 
-Each seed is a thin line; the thick line and the band are centre and spread over **all** runs of a range
-(`ssmail.evaluation.statistics`). Runs that diverge are drawn and counted as in figure 4. The dotted line is constant
+Thin lines are seeds; the thick line and the band are centre and spread over **all** runs of a range
+(`ssmail.evaluation.statistics`). Diverged runs are drawn and counted as in figure 4. The dotted line is constant
 velocity.
 
-Deviation: the paper's figure is of Noisy Mocap alone; this one can be drawn of another environment too.
+Deviation: the paper's figure shows only Noisy Mocap; this one can be drawn for another environment too.
 
-Claim C5: negative alpha lowers the final error and lets training converge sooner. The "training loss" of the claim is
-read as the error of the upper panel, because the loss of Eq. 3 cannot be compared between ranges of alpha. Both ranges
-have to reach the same level, which favours neither.
+Claim C5: negative alpha lowers the final error and lets training converge sooner. The claim's "training loss" is taken
+to be the error of the upper panel, for the reason given above. Both ranges have to reach the same level, which favours
+neither.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,14 +29,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
 from ssmail.paper.samples import WORST, Floats, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import constant_velocity
-from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.curves import Band, band, check_recorded
 from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
@@ -44,14 +44,10 @@ from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig8"
-ERRORS = {
-    "mocap": "mse",
-    "letters": "mse",
-    "yjunction": "mode_mse",
-}  # by environment: the error that tells how well a policy does
+ERRORS = {"mocap": "mse", "letters": "mse", "yjunction": "mode_mse"}  # of the upper panel, by environment
 TERMS = ("discriminator/generated", "discriminator/expert")
 LOSS = " + ".join(TERMS)
-UNDECIDED = 0.5  # the loss of a D that says 1/2 of everything
+UNDECIDED = 0.5  # the loss of a D that outputs 1/2 everywhere
 CLAIM = Claim(
     name="C5",
     alias="alpha",
@@ -67,11 +63,11 @@ EPOCHS = "epochs until train/mse stays at or below twice the median final error 
 
 @dataclass(frozen=True, eq=False)
 class AlphaRecord:
-    """Everything that figure 8 shows."""
+    """The contents of figure 8."""
 
     error: str  # the metric of the upper panel
     errors: tuple[Band, ...]  # one for each range; squared scaled units
-    losses: tuple[Band, ...]  # likewise; of LOSS
+    losses: tuple[Band, ...]  # LOSS, one for each range
     statistic: Statistic
     constant_velocity: float | None  # squared scaled units; None when no run finished
     provenance: Provenance
@@ -97,9 +93,9 @@ def collect(
     statistic: Statistic = Statistic.MEAN_STD,
     environment: str | None = None,
 ) -> AlphaRecord:
-    """The runs that `ssmail.plots.series` chooses, or those of the given ids, on `environment` (or that
-    of the ablation).
+    """Collect the runs that the figure draws by default, or those of the given ids.
 
+    `environment` is that of the ablation by default.
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
     """
     selection = select(store, NAME, runs, profile, environment)
@@ -128,19 +124,17 @@ def collect(
 def _bands(
     store: Store, selection: Selection, name: str, metrics: Sequence[str], statistic: Statistic
 ) -> tuple[Band, ...]:
-    """Of the sum of the metrics, epoch by epoch; unknown where one of them is."""
+    """The bands of the sum of the metrics at each epoch; unknown where one of them is."""
     values = store.metrics([run.id for run in selection.runs], names=metrics)
     for metric in metrics:
-        for group in selection.groups:
-            for run in silent(group, values[values["name"] == metric]):
-                raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
+        check_recorded(selection.groups, metric, values[values["name"] == metric])
     wide = values.pivot(index=["run_id", "step"], columns="name", values="value")
     summed = wide.sum(axis="columns", skipna=False).rename("value").reset_index()
     return tuple(band(group, name, summed, statistic) for group in selection.groups)
 
 
 def common_level(finals: Sequence[float]) -> float:
-    """LEVEL times the median of the final errors that are finite; NaN when none is."""
+    """LEVEL times the median of the finite final errors; NaN without any."""
     finite = [value for value in finals if np.isfinite(value)]
     return LEVEL * float(np.median(finite)) if finite else np.nan
 
@@ -178,7 +172,7 @@ def decide(
 
 
 def draw(record: AlphaRecord) -> Figure:
-    """The policy's error above, logarithmic, and the discriminator's loss below, linear. The legend stands above."""
+    """Draw the policy's error (logarithmic) above the discriminator's loss (linear), with the legend above."""
     with style.sheet():
         figure = style.new_figure(height=3.4)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])

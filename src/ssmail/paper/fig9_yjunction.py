@@ -1,9 +1,9 @@
 """Figure 9 (sections 4.1, B.2): a snapshot of the Y-Junction environment.
 
-The road, its fork and its two lanes; on it, one training trajectory of the expert for each lane (the first of that
-lane) with its agents at a few time steps: filled on the first trajectory, open on the second. The road is drawn twice
-as wide as the expert set strays from the centre lines. Any stored Y-Junction run will do, whatever its method; by
-default it is the newest that holds the expert set.
+The figure shows the road with its fork and two lanes, and the first training trajectory of the expert on each lane,
+with its agents at a few time steps: filled markers on the first trajectory, open ones on the second. The road is drawn
+twice as wide as the expert set strays from the centre lines. Any stored Y-Junction run provides the data, whatever its
+method; by default it is the newest one that holds the expert set.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from ssmail.store import RunRow, Store
 
 NAME = "fig9"
 ARRAYS = ("train/expert", "train/lane", "lane_centres")
-SNAPSHOTS = 4  # time steps at which the agents are shown, the first and the last among them
+SNAPSHOTS = 4  # time steps at which the agents are shown, including the first and the last
 MARKERS = ("o", "s", "^", "D", "v", "P")
 
 Floats = npt.NDArray[np.floating]
@@ -33,7 +33,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class YJunctionRecord:
-    """Everything that figure 9 shows. Positions are in step lengths (the approach speed times one step)."""
+    """The contents of figure 9. Positions are in step lengths (the approach speed times one step)."""
 
     trajectories: Floats  # (R, T, N, 2) one for each lane that the training set uses
     lanes: Integers  # (R,) the lane of each
@@ -56,9 +56,10 @@ class YJunctionRecord:
 
 
 def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> YJunctionRecord:
-    """The environment as the newest run that holds it stored it; among the given ids, if there are any, else among the
-    runs on the same data (a compact database holds the expert set once).
+    """Collect the environment from the newest run that holds it.
 
+    With ids, that is the newest of these runs, or else of the runs on the same data, because a compact database keeps
+    the expert set only once.
     Raises NoRuns when no run of the environment holds its expert set, InputError for an unfit id.
     """
     run, notes = _source(store, runs, profile)
@@ -95,7 +96,7 @@ def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tup
 
 
 def _holding(store: Store, runs: Sequence[RunRow], environment: str) -> list[RunRow]:
-    """Those of the runs that hold the environment's expert set."""
+    """The runs that hold the environment's expert set."""
     return [run for run in runs if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))]
 
 
@@ -106,14 +107,14 @@ def _strays(trajectories: Floats, line: Floats) -> float:
 
 
 def _fork(centre_lines: Floats) -> tuple[float, float]:
-    """The last point that the centre lines (L, P, 2) share; the first point if they never do."""
+    """The last point that the centre lines (L, P, 2) share, or the first point if they share none."""
     together = np.isclose(centre_lines, centre_lines[0]).all(axis=(0, 2))  # (P,)
     x, y = centre_lines[0, max(int(together.argmin()) - 1, 0)]
     return float(x), float(y)
 
 
 def draw(record: YJunctionRecord) -> Figure:
-    """The record seen from above, both axes at one scale; the legend of the agents stands above."""
+    """Draw the environment from above, both axes on one scale, with the legend of the agents above."""
     with style.sheet():
         figure = style.new_figure(height=_height(record))
         axes = figure.add_subplot()
@@ -130,7 +131,7 @@ def draw(record: YJunctionRecord) -> Figure:
 
 
 def _height(record: YJunctionRecord) -> float:
-    """Inches that equal scales need at one column's width, with labels and legend."""
+    """The height in inches, labels and legend included, for equal scales at one column's width."""
     extent = np.ptp(record.centre_lines, axis=(0, 1))
     return float(np.clip(2.5 * extent[1] / extent[0], 0.8, 3.5)) + 0.85
 
@@ -148,7 +149,7 @@ def _draw_road(axes: Axes, record: YJunctionRecord) -> None:
 
 
 def _outline(line: Floats, half_width: float) -> Floats:
-    """(2 P, 2) the edge of a strip along a line (P, 2)."""
+    """The outline (2 P, 2) of a strip along a line (P, 2)."""
     along = np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     sideways = half_width * np.stack([-along[:, 1], along[:, 0]], axis=1)
@@ -156,7 +157,7 @@ def _outline(line: Floats, half_width: float) -> Floats:
 
 
 def _draw_agents(axes: Axes, trajectory: Floats, steps: Integers, first: bool) -> None:
-    """(T, N, 2): each agent's track, and the agent itself at `steps`."""
+    """Draw each agent's track (T, N, 2), and markers at `steps`."""
     for agent in range(trajectory.shape[1]):
         colour = style.AGENTS[agent % len(style.AGENTS)]
         x, y = trajectory[:, agent].T
@@ -175,7 +176,7 @@ def _draw_agents(axes: Axes, trajectory: Floats, steps: Integers, first: bool) -
 
 
 def _draw_times(axes: Axes, record: YJunctionRecord) -> None:
-    """The time step beside the middle agent of each shown group, above the upper lane."""
+    """Write the time step beside the middle agent of each snapshot, above the upper lane."""
     upper = record.trajectories[record.trajectories[:, -1, 0, 1].argmax()]
     middle = upper[:, upper.shape[1] // 2]
     for step in record.steps:

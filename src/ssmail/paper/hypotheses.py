@@ -1,6 +1,6 @@
-"""The four kinds of statement that claims are made of, each with its test, its effect and its power calculation.
+"""The four kinds of hypotheses that claims are made of, each with its test, its effect and its power calculation.
 
-A sample without runs, or with a value that is unknown, leaves a statement untested: its part says why.
+A hypothesis stays untested where a sample has no runs or an unknown value; the part then states the reason.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from ssmail.paper.claims import Part, Sample
 
 Side = Literal["below", "above"]
 
-LEAST_FOR_SPREAD = 2  # seeds; one has none
+LEAST_FOR_SPREAD = 2  # seeds: a single one has no spread
 
 
 class _Tested(NamedTuple):
-    """What a test found, by the names of Part."""
+    """The results of a test, under the names of Part."""
 
     effect: Estimate
     effect_is: str
@@ -34,9 +34,9 @@ class _Tested(NamedTuple):
 
 
 def every_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
-    """Every seed of a method is below (above) the bar: one counterexample contradicts it.
+    """Test that every seed of a method is below (above) the bar: one counterexample contradicts it.
 
-    n of n seeds support it once they rule out that half of all seeds, or fewer, are: p = 2 ** -n, from five seeds on.
+    n of n seeds support it once they rule out that only half of all seeds are: p = 2 ** -n, from five seeds on.
     """
 
     def tested() -> _Tested:
@@ -49,7 +49,7 @@ def every_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: 
 
 
 def median_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
-    """The median over all seeds of a method is below (above) the bar: sign test."""
+    """Test that the median over all seeds of a method is below (above) the bar, with a sign test."""
 
     def tested() -> _Tested:
         found = hypothesis_tests.sign_test(sample.values, bar)
@@ -61,7 +61,7 @@ def median_seed(statement: str, statistic: str, sample: Sample, side: Side, bar:
 
 
 def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Part:
-    """Runs of `small` have smaller values than those of `great`: rank test, shift by Hodges and Lehmann."""
+    """Test that runs of `small` have smaller values than those of `great`: rank test, Hodges-Lehmann shift."""
 
     def tested() -> _Tested:
         needed = seeds_for_rank_test(hypothesis_tests.superiority(small.values, great.values))
@@ -73,10 +73,10 @@ def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Par
 
 
 def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> Part:
-    """Runs of `tight` spread less than those of `wide`: rank test of the distances from each group's own median.
+    """Test that runs of `tight` spread less than those of `wide`: rank test of distances from each group's own median.
 
-    It is Brown and Forsythe's test on ranks, without the structural zero of each group. The distances of one group are
-    not independent of each other, so its level is only nearly ALPHA (tests/evaluation/test_statements.py measures it).
+    This is Brown and Forsythe's test on ranks, without the structural zero of each group. Distances within a group
+    depend on each other, so its level is only close to ALPHA (tests/paper/claims/test_claim_verdicts.py measures it).
     """
 
     def tested() -> _Tested:
@@ -91,7 +91,7 @@ def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> 
 
 
 def _inside(sample: Sample, side: Side, bar: float) -> int:
-    """How many values are beyond the bar on that side; one that is equal to it is not."""
+    """Count the values strictly beyond the bar on that side."""
     values = np.array(sample.values)
     return int((values < bar).sum() if side == "below" else (values > bar).sum())
 
@@ -109,17 +109,16 @@ def _part(
     tested: Callable[[], _Tested],
     least: int = 1,
 ) -> Part:
-    """The part, with what `tested` finds unless a sample lacks something."""
+    """The part with the results of `tested`, which runs only when no sample lacks anything."""
     what = (statement, statistic, test, samples)
     reasons = [text for sample in samples if (text := _lacking(sample, least))]
     if reasons:
         return Part(*what, UNKNOWN, "", 1.0, 1.0, reason="; ".join(reasons))
-    found = tested()
-    return Part(*what, found.effect, found.effect_is, found.p_for, found.p_against, seeds=found.seeds)
+    return Part(*what, **tested()._asdict())
 
 
 def _lacking(sample: Sample, least: int) -> str:
-    """Why a sample cannot be tested, or nothing."""
+    """Why a sample cannot be tested; empty when it can."""
     if not sample.seeds:
         return f"no runs of {sample.label}"
     if sample.unknown:

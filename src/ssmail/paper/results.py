@@ -26,17 +26,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FigureModule:
-    """One figure: its name in the paper, its alias, and its module, imported at first use."""
+    """One figure of the paper: its name, its alias, and its module, which is imported at first use."""
 
     name: str
     alias: str
     summary: str
-    has_statistic: bool = False  # whether it shows a centre and spread, of one's choice
-    has_environment: bool = False  # whether it can be drawn of another environment than its own
+    has_statistic: bool = False  # whether its centre and spread can be chosen
+    has_environment: bool = False  # whether it can be drawn for another environment
 
     @property
     def stem(self) -> str:
-        """The name of the module and, without the ending, of the files that are saved."""
+        """The name of the module, and of the saved files without the ending."""
         return f"{self.name}_{self.alias}".replace("-", "_")
 
     def collect(
@@ -48,10 +48,11 @@ class FigureModule:
         statistic: "Statistic | None" = None,
         environment: str | None = None,
     ) -> FigureRecord:
-        """The record from `store`; `runs` (ids or their beginnings) replaces the default choice of runs, of `profile`.
+        """Collect the record from `store`.
 
-        `statistic`, mean-std by default, and `environment`, the paper's by default, are for figures that have one, and
-        of no effect on others. Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
+        `runs` (ids or their beginnings) replace the default choice of runs, which `profile` restricts. `statistic`
+        (mean-std by default) and `environment` (the paper's by default) have no effect on figures without that option.
+        Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
         """
         options: dict[str, Any] = {}
         if self.has_statistic and statistic is not None:
@@ -61,16 +62,16 @@ class FigureModule:
         return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
 
     def draw(self, record: FigureRecord) -> "Figure":
-        """The record as a matplotlib Figure, one column wide."""
+        """Draw the record as a matplotlib Figure, one column wide."""
         return cast("Figure", self._module().draw(record))
 
     @property
     def claim(self) -> "Claim":
-        """The claim that is read off the figure, of one of CLAIMS."""
+        """The claim that is read off the figure; only those of CLAIMS have one."""
         return cast("Claim", self._module().CLAIM)
 
     def decide(self, runs: "Runs") -> "tuple[Part, ...]":
-        """The tested parts of the claim, from the figure's runs."""
+        """Test the parts of the claim on the figure's runs."""
         module = self._module()
         return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
 
@@ -108,7 +109,7 @@ CLAIMS = ("fig4", "fig5", "fig6", "fig7", "fig8", "fig3", "fig1", "fig2")
 def save(
     name: str, record: FigureRecord, figure: "Figure", outdir: Path, formats: Sequence[str] = ("png",)
 ) -> list[Path]:
-    """Write the figure in each of `formats` (png, pdf, svg) and the CSV of what it shows; return the paths, CSV last.
+    """Write the figure in each of `formats` (png, pdf, svg) and a CSV of its contents; return the paths, CSV last.
 
     `name` is a key of FIGURES. Raises InputError for an unknown format or a folder that cannot be written.
     """

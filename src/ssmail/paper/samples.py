@@ -114,7 +114,7 @@ class Runs:
 def _computed(
     read: Callable[[RunRow], list[Array]], number: Callable[..., float], diverged: float
 ) -> Callable[[RunRow], float]:
-    """The function that computes a finished run's number from what `read` finds: see the top of this module."""
+    """Return the function that computes a finished run's number from the values that `read` returns."""
 
     def value(run: RunRow) -> float:
         values = read(run)

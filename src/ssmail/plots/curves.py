@@ -17,6 +17,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from ssmail.errors import InputError
 from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.plots import style
@@ -128,6 +129,13 @@ def silent(group: Group, values: pd.DataFrame) -> list[RunRow]:
     """The runs of the group that have no value, other than diverged ones: there is nothing to draw of them."""
     there = set(values["run_id"])
     return [run for run in group.runs if run.id not in there and run.state is not RunState.DIVERGED]
+
+
+def check_recorded(groups: Sequence[Group], metric: str, values: pd.DataFrame) -> None:
+    """Raise InputError for a run that recorded no value of the metric, unless it diverged."""
+    for group in groups:
+        for run in silent(group, values):
+            raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
 
 
 def _curve(run: RunRow, values: pd.DataFrame, reached: int, error: bool) -> Curve:

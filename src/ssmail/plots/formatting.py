@@ -37,6 +37,13 @@ def setting(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def short_code(code: str) -> str:
+    """The code of a run with eight digits of the commit: "0.1.0+703fd585", with "-dirty" where it stands."""
+    version, plus, commit = code.partition("+")
+    dirty = "-dirty" if commit.endswith("-dirty") else ""
+    return f"{version}{plus}{commit[:8]}{dirty}"
+
+
 def counted(count: int, noun: str) -> str:
     """ "1 run", "2 runs"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"

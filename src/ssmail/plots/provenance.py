@@ -64,7 +64,7 @@ class Provenance:
             run_ids=tuple(run.id for run in runs),
             spec_hashes=_distinct(run.spec_hash for run in runs),
             dataset_hashes=_distinct(run.dataset_hash for run in runs if run.dataset_hash),
-            code=_distinct(_code(run) for run in runs),
+            code=_distinct(run.code for run in runs),
             drawn_with=__version__,
             runs=tuple(_source(run) for run in runs),
             differs=spec_differences(runs),
@@ -133,13 +133,8 @@ def _source(run: RunRow) -> RunSource:
         state=run.state.value,
         spec_hash=run.spec_hash,
         dataset_hash=run.dataset_hash,
-        code=_code(run),
+        code=run.code,
     )
-
-
-def _code(run: RunRow) -> str:
-    commit = f"+{run.git_commit}" if run.git_commit else ""
-    return f"{run.package_version}{commit}{'-dirty' if run.git_dirty else ''}"
 
 
 def _png_text(path: Path) -> str:

@@ -55,6 +55,12 @@ class RunRow:
         """The first eight digits of the id, enough for people."""
         return self.id[:8]
 
+    @property
+    def code(self) -> str:
+        """The code that computed the run: "0.1.0+COMMIT", with "-dirty" where the tree was changed."""
+        commit = f"+{self.git_commit}" if self.git_commit else ""
+        return f"{self.package_version}{commit}{'-dirty' if self.git_dirty else ''}"
+
     @cached_property
     def spec(self) -> dict[str, Any]:
         """The run's spec as plain nested values, with what an earlier version had no key for."""

@@ -107,7 +107,7 @@ def test_markdown_has_the_same_with_figures_beside_it(written: Written) -> None:
             assert len(re.findall(r"(?<!\\)\|", line)) in (5, 7, 9), line
     assert "squared scaled units): 0: 0.002, 1: 0.0021, 2: 0.0022, 3: 0.0023, 4: 0.0024\n" in text
     assert "### fig7 noise\n\nNot drawn: there is no data/mocap.npz." in text
-    assert f"- Again: `{COMMAND}`" in text
+    assert f"- To reproduce: `{COMMAND}`" in text
 
 
 def test_figures_that_are_no_pictures_are_linked_all_the_same(written: Written, tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ class _Reader:
         self.frame, self.begun, self.named = self.frame + 1, at, 0
 
     def add(self, at: int, words: list[str]) -> None:
-        """A joint's line of the current frame."""
+        """Add a joint's line to the current frame."""
         channel = self.channels[words[0]]
         if len(words) != channel.width + 1:
             numbers = f"{len(words) - 1} {'number' if len(words) == 2 else 'numbers'}"

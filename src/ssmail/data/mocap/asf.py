@@ -89,7 +89,7 @@ def parse_skeleton(contents: bytes, file: str) -> Skeleton:
     sections = _sections(contents, file)
     for needed in (":root", ":bonedata", ":hierarchy"):
         if needed not in sections:
-            raise InputError(f"{file} has no section {needed}, so it is no whole .asf file; {AGAIN}")
+            raise InputError(f"{file} has no section {needed}, so it is not a complete .asf file; {AGAIN}")
     # units and bones
     length_unit, degrees = _units(sections.get(":units", []))
     scale = math.pi / 180 if degrees else 1.0

@@ -23,7 +23,6 @@ from ssmail.data.mocap.amc import parse_motion
 from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions
 from ssmail.data.mocap.source import Source, find_subject, open_source, shown
-from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 
@@ -99,8 +98,12 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
             names = {trial: subject.trials[trial] for trial in trials}
             splits[split] = _split(files, names, skeleton, wanted.window_of(split), sources)
     made = wanted.model_copy(update={**used, "missing": missing, "length_unit": skeleton.length_unit})
-    _check_scale(splits["train"], source)
-    return bundle(splits, made, skeleton.joints, skeleton.parents, sources)
+    experts = bundle(splits, made, skeleton.joints, skeleton.parents, sources)
+    try:
+        _ = experts.scaling
+    except ValueError:
+        raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
+    return experts
 
 
 def bundle(
@@ -153,13 +156,6 @@ def _split(
         frames += [motion.first + 1 + start for start in starts]
     locations, velocities = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     return Trajectories.single_mode(locations, velocities, np.array(trials), np.array(frames))
-
-
-def _check_scale(train: Trajectories, source: Path) -> None:
-    try:
-        Scaling.fit(train.positions, train.velocities)
-    except ValueError:
-        raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
 
 
 def _read(files: Source, name: str, sources: dict[str, str]) -> bytes:

@@ -5,6 +5,7 @@ that is already in the cache. A file is checked before it gets its name in the c
 package knows it (cmu_sha256.txt: the trials of subject 35 that the paper uses), else against its first bytes.
 """
 
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -26,9 +27,7 @@ LICENCE = (
 )
 SHA256 = dict(line.split() for line in Path(__file__).with_name("cmu_sha256.txt").read_text("ascii").splitlines())
 TRANSIENT = frozenset({408, 429, 500, 502, 503, 504})  # HTTP statuses after which another attempt may succeed
-FIRST_BYTES = frozenset(
-    bytes([byte]) for byte in b"#:0123456789"
-)  # of a skeleton or a motion: a comment, a keyword, the number of a frame
+BEGINNING = re.compile(rb"\s*[#:0-9]")  # a skeleton or a motion begins with a comment, a keyword or a frame number
 REMEDY = "run the same command again later, or read a local copy of the files with --source"
 
 
@@ -123,7 +122,7 @@ def _stream(url: str, output: str, _: pooch.Pooch, *, timeout: float) -> None:
             raise SsmailError(f"{url} comes without its length, so a cut connection would not be noticed; {REMEDY}")
         with path.open("wb") as file:
             for chunk in response.iter_content(2**16):
-                if not file.tell() and chunk.lstrip()[:1] not in FIRST_BYTES:
+                if not file.tell() and not BEGINNING.match(chunk):
                     raise SsmailError(f"{url} is a web page or another file, not motion capture data; {REMEDY}")
                 file.write(chunk)
                 if file.tell() > largest:

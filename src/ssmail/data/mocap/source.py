@@ -12,25 +12,56 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 from ssmail.errors import InputError
 
 LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes; the files of subject 35 have 7 kB and 0.5 MB
 
 
-class Source(Protocol):
-    """A collection of files by name."""
+@dataclass(frozen=True)
+class _Folder:
+    path: Path
 
-    @property
-    def path(self) -> Path:
-        """The folder or zip file."""
+    def names(self) -> Iterator[str]:
+        def refuse(error: OSError) -> None:
+            raise InputError(f"{error.filename} cannot be read: {error.strerror}; choose another --source")
 
-    def names(self) -> Iterable[str]:
-        """Return the paths of all files relative to `path`."""
+        for folder, _, files in os.walk(self.path, onerror=refuse):
+            below = Path(folder).relative_to(self.path)
+            yield from ((below / file).as_posix() for file in files)
 
     def read(self, name: str) -> bytes:
-        """Read a file. Raises InputError if it cannot be read, or if it is larger than LARGEST for its kind."""
+        path = self.path / name
+        try:
+            if not path.is_file():  # a pipe would block
+                raise InputError(f"{shown(str(path))} is not a file; put the file there")
+            with path.open("rb") as file:
+                return _whole(file, name, shown(str(path)))
+        except OSError as error:
+            raise InputError(f"{shown(str(path))} cannot be read: {error.strerror}; check its permissions") from None
+
+
+@dataclass(frozen=True)
+class _Archive:
+    path: Path
+    archive: zipfile.ZipFile
+
+    def names(self) -> Iterator[str]:
+        return (member.filename for member in self.archive.infolist() if not member.is_dir())
+
+    def read(self, name: str) -> bytes:
+        label = f"{shown(name)} in {self.path}"
+        try:
+            with self.archive.open(name) as file:
+                return _whole(file, name, label)
+        except RuntimeError:  # zipfile's word for a password; NotImplementedError, for an exotic method, is one too
+            raise InputError(f"{label} is encrypted or packed in an unusual way; pack it plainly") from None
+        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError):
+            raise InputError(f"{label} is damaged; get the zip file again") from None
+
+
+Source = _Folder | _Archive  # `path`, the `names` of all files relative to it, and `read`, a file by its name
 
 
 @dataclass(frozen=True)
@@ -88,49 +119,8 @@ def shown(name: str) -> str:
     return name if name.isprintable() else repr(name)
 
 
-@dataclass(frozen=True)
-class _Folder:
-    path: Path
-
-    def names(self) -> Iterator[str]:
-        def refuse(error: OSError) -> None:
-            raise InputError(f"{error.filename} cannot be read: {error.strerror}; choose another --source")
-
-        for folder, _, files in os.walk(self.path, onerror=refuse):
-            below = Path(folder).relative_to(self.path)
-            yield from ((below / file).as_posix() for file in files)
-
-    def read(self, name: str) -> bytes:
-        path = self.path / name
-        try:
-            if not path.is_file():  # a pipe would block
-                raise InputError(f"{shown(str(path))} is not a file; put the file there")
-            with path.open("rb") as file:
-                return _whole(file, name, shown(str(path)))
-        except OSError as error:
-            raise InputError(f"{shown(str(path))} cannot be read: {error.strerror}; check its permissions") from None
-
-
-@dataclass(frozen=True)
-class _Archive:
-    path: Path
-    archive: zipfile.ZipFile
-
-    def names(self) -> Iterator[str]:
-        return (member.filename for member in self.archive.infolist() if not member.is_dir())
-
-    def read(self, name: str) -> bytes:
-        label = f"{shown(name)} in {self.path}"
-        try:
-            with self.archive.open(name) as file:
-                return _whole(file, name, label)
-        except RuntimeError:  # zipfile's word for a password; NotImplementedError, for an exotic method, is one too
-            raise InputError(f"{label} is encrypted or packed in an unusual way; pack it plainly") from None
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError):
-            raise InputError(f"{label} is damaged; get the zip file again") from None
-
-
 def _whole(file: IO[bytes], name: str, label: str) -> bytes:
+    """Read a file whole. Raises InputError if it is larger than LARGEST for its kind; `label` names it there."""
     largest = LARGEST[name[-4:].lower()]
     contents = file.read(largest + 1)
     if len(contents) > largest:

@@ -1,5 +1,5 @@
-"""The report of a reproduction: verdicts, figures and the runs behind them, as one HTML page and as Markdown.
+"""The report on a reproduction: verdicts, figures and the runs behind them, as one HTML page and as Markdown.
 
-`drawing` saves a figure and keeps what the report shows of it, `contents` gathers what a report holds, `pages` writes
-it. Importing this package imports neither Jinja2 nor matplotlib.
+`drawing` draws and saves a figure for the report, `contents` gathers the rest, `pages` writes the files. Importing this
+package imports neither Jinja2 nor matplotlib.
 """

@@ -1,4 +1,4 @@
-"""What a report holds: the claims as judged, the figures as drawn, and every run behind either of them."""
+"""The contents of a report: judged claims, drawn figures, and all runs behind them."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,30 +17,30 @@ from ssmail.store.comparison import spec_differences
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that is written, in the order of the pages. `written` is in UTC."""
+    """Everything on the pages, in their order. `written` is in UTC."""
 
     database: str
-    command: str  # that makes this report, the runs included
+    command: str  # that produces this report, including its runs
     written: datetime
     judgements: tuple[Judgement, ...]
     figures: tuple[Drawn, ...]
     runs: tuple[RunRow, ...]  # by environment, method, spec and seed
-    differs: Mapping[str, Mapping[str, Any]]  # by spec hash: in what specs of a method and an environment differ
-    unfinished: tuple[str, ...]  # a line for each run that was wanted and did not finish
+    differs: Mapping[str, Mapping[str, Any]]  # by spec hash: see spec_differences
+    unfinished: tuple[str, ...]  # one line for each requested run that did not finish
 
     @property
     def verdicts(self) -> Counter[Verdict]:
-        """How many claims got each verdict."""
+        """The number of claims with each verdict."""
         return Counter(found.verdict for found in self.judgements)
 
     @property
     def states(self) -> Counter[str]:
-        """How many runs are in each state."""
+        """The number of runs in each state."""
         return Counter(run.state.value for run in self.runs)
 
     @property
     def seconds(self) -> float:
-        """What all runs took, one after the other."""
+        """The wall time of all runs together."""
         return sum(run.wall_seconds for run in self.runs)
 
     @property
@@ -50,12 +50,12 @@ class Report:
 
     @property
     def last(self) -> datetime:
-        """When the last run ended, or gave its last sign of life."""
+        """When the last run ended, or last sent a heartbeat."""
         return max(run.finished or run.heartbeat for run in self.runs)
 
     @cached_property
     def specs(self) -> dict[str, RunRow]:
-        """A run for each spec, by hash, in the order of the runs."""
+        """One run for each spec, by spec hash, in the order of the runs."""
         specs: dict[str, RunRow] = {}
         for run in self.runs:
             specs.setdefault(run.spec_hash, run)
@@ -66,10 +66,6 @@ class Report:
         """Every run by its full id."""
         return {run.id: run for run in self.runs}
 
-    def distinct(self, column: str) -> list[Any]:
-        """The values that a column of the runs has, each once and sorted."""
-        return sorted({getattr(run, column) for run in self.runs if getattr(run, column) is not None})
-
 
 def gather(
     store: Store,
@@ -78,7 +74,7 @@ def gather(
     command: str,
     unfinished: Sequence[str] = (),
 ) -> Report:
-    """The report of these figures and judgements, with all of their runs."""
+    """Return the report on these figures and judgements, with all of their runs."""
     wanted = {run for found in judgements for run in found.runs}
     wanted |= {run for drawn in figures if drawn.provenance for run in drawn.provenance.run_ids}
     runs = sorted(
@@ -98,21 +94,15 @@ def gather(
 
 
 def _nearby(where: str) -> str:
-    """The path from the working folder, if it lies in it; a report is read on other machines, too."""
+    """Make a path inside the working folder relative, because a report is read on other machines too."""
     path = Path(where)
     return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else where
 
 
 def samples_of(found: Judgement) -> list[tuple[Part, Sample]]:
-    """The samples of a claim, each once, with a part whose statistic they are values of."""
+    """Return the samples of a claim, each once, with a part that states their statistic."""
     seen: dict[tuple[str, str], tuple[Part, Sample]] = {}
     for part in found.decision.parts:
         for sample in part.samples:
             seen.setdefault((part.statistic, sample.label), (part, sample))
     return list(seen.values())
-
-
-def code_of(run: RunRow) -> str:
-    """ "0.1.0+703fd585", with "-dirty" where the files had been changed."""
-    commit = f"+{run.git_commit[:8]}" if run.git_commit else ""
-    return f"{run.package_version}{commit}{'-dirty' if run.git_dirty else ''}"

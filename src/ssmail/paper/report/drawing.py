@@ -1,4 +1,4 @@
-"""One figure, saved to its files, with what the report shows of it."""
+"""Draw and save a figure of the paper, and keep what the report shows of it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,18 +9,19 @@ from typing import TYPE_CHECKING
 
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES, save
+from ssmail.plots import provenance
 from ssmail.plots.provenance import Provenance
 from ssmail.store import Store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SHOWN = 250  # dots per inch of a picture that is in the report alone
+EMBEDDED_RESOLUTION = 250  # dots per inch of a picture that is only in the report
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure: its `files` (the CSV last), `provenance` and `notes`, or why it `lacks` all this."""
+    """A figure with its `files` (the CSV last), `provenance` and `notes`; or else why it `lacks` all of these."""
 
     name: str
     files: tuple[Path, ...] = ()
@@ -31,17 +32,17 @@ class Drawn:
 
     @property
     def alias(self) -> str:
-        """What else it is called."""
+        """Its name in words, such as "stability"."""
         return FIGURES[self.name].alias
 
     @property
     def summary(self) -> str:
-        """What it shows, in a line."""
+        """One line on what it shows."""
         return FIGURES[self.name].summary
 
     @cached_property
     def image(self) -> bytes:
-        """The PNG that was saved; without one, another; nothing of a figure that is not drawn."""
+        """The saved PNG, or one made for the report; empty for a figure that was not drawn."""
         from ssmail.plots import style
 
         for path in self.files:
@@ -50,7 +51,7 @@ class Drawn:
         picture = BytesIO()
         if self.figure is not None:
             with style.sheet():
-                self.figure.savefig(picture, format="png", dpi=SHOWN)
+                self.figure.savefig(picture, format="png", dpi=EMBEDDED_RESOLUTION)
         return picture.getvalue()
 
 
@@ -64,15 +65,12 @@ def draw(
     profile: str | None = None,
     statistic: Statistic | None = None,
 ) -> Drawn:
-    """Collect, draw and save the figure `name` ("fig4") of these runs (ids), or of those that it chooses by itself.
+    """Collect, draw and save the figure `name` ("fig4") of these runs (ids), or of its default choice.
 
-    Raises what the figure's `collect` and `ssmail.figures.save` raise.
+    Raises what FigureModule.collect and `ssmail.paper.results.save` raise.
     """
-    from ssmail.plots.saving import embedded
-
     module = FIGURES[name]
     record = module.collect(store, runs, profile=profile, statistic=statistic)
     figure = module.draw(record)
     files = save(name, record, figure, out, formats)
-    provenance = embedded(record, files[-1].read_text(encoding="utf-8"))
-    return Drawn(module.name, tuple(files), figure, provenance, record.notes)
+    return Drawn(module.name, tuple(files), figure, provenance.read(files[0]), record.notes)

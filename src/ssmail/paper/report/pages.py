@@ -1,4 +1,4 @@
-"""A report as files: one HTML page that needs nothing else, and Markdown that shows the figures beside it."""
+"""Write a report as one self-contained HTML page, and as Markdown that links to the saved figures."""
 
 import os
 from base64 import b64encode
@@ -15,19 +15,19 @@ from ssmail import __version__
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
 from ssmail.paper.claims import Verdict
-from ssmail.paper.report.contents import Report, code_of, samples_of
+from ssmail.paper.report.contents import Report, samples_of
 from ssmail.paper.report.drawing import Drawn
 from ssmail.plots import formatting
 from ssmail.store import RunRow
 
 MARKDOWN, HTML = "report.md", "report.html"
 TEMPLATES = Path(__file__).with_name("templates")
-INLINE = (".png", ".svg")  # formats that Markdown shows
+INLINE = (".png", ".svg")  # formats that Markdown viewers display
 SIGNS = {Verdict.SUPPORTED: "✓", Verdict.CONTRADICTED: "✗", Verdict.INCONCLUSIVE: "?"}
 
 
 def write(report: Report, folder: Path) -> list[Path]:
-    """Write report.md and report.html into the folder, each at once or not at all, and return their paths.
+    """Write report.md and report.html into the folder atomically, and return their paths.
 
     Raises InputError for a folder that cannot be written.
     """
@@ -43,13 +43,13 @@ def write(report: Report, folder: Path) -> list[Path]:
 
 
 def html(report: Report) -> str:
-    """The page, with its style, its script and the figures inside."""
+    """Render the HTML page, with style, script and figures inline."""
     parts = {name: Markup((TEMPLATES / f"report.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
     return _environment(autoescape=True).get_template("report.html.j2").render(report=report, **parts)
 
 
 def markdown(report: Report, folder: Path) -> str:
-    """The same in Markdown, without whole specs; `folder` is where it is going to be, for the paths of the figures."""
+    """Render the report as Markdown, without whole specs. Paths of figures are relative to `folder`."""
 
     def path(drawn: Drawn) -> str:
         return _relative(drawn, folder)
@@ -74,7 +74,8 @@ def _environment(autoescape: bool) -> Environment:
         "base64": lambda data: b64encode(data).decode("ascii"),
         "sign": SIGNS.__getitem__,
         "cell": lambda text: str(text).replace("|", "\\|").replace("\n", " "),
-        "code": code_of,
+        "code": formatting.short_code,
+        "distinct": lambda values: sorted({value for value in values if value is not None}),
         "samples": samples_of,
         "differences": _differences,
         "whole": _whole,
@@ -84,16 +85,16 @@ def _environment(autoescape: bool) -> Environment:
 
 
 def _differences(values: Mapping[str, Any]) -> str:
-    """In what a spec differs from others, as "beta 0.15, epochs 40"."""
+    """Format the keys in which a spec differs from others: "beta 0.15, epochs 40"."""
     return ", ".join(f"{key.rpartition('.')[2]} {formatting.setting(value)}" for key, value in values.items())
 
 
 def _whole(run: RunRow) -> str:
-    """Its spec as YAML."""
+    """Format the run's spec as YAML."""
     return str(yaml.safe_dump(run.spec, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True))
 
 
 def _relative(drawn: Drawn, folder: Path) -> str:
-    """The path of the figure's picture from the folder, as a link; that of any file of it when none is a picture."""
+    """The link from the folder to the figure's picture, or to its first file when Markdown can display none."""
     pictures = [file for file in drawn.files if file.suffix in INLINE] or list(drawn.files)
     return quote(Path(os.path.relpath(pictures[0], folder)).as_posix())
