@@ -188,7 +188,7 @@ def test_a_run_far_above_the_others_does_not_flatten_them(store: Store, runs: li
     add_forecast(3, 100.0, method="dnri", steps=STEPS)
     record = fig7_noise.collect(store)
     clean = record.panels[0]
-    assert clean.end == pytest.approx(fig7_noise.REACH * 0.007 * 4)  # the median of dnri's peaks
+    assert clean.end == pytest.approx(fig7_noise.SCALE_LIMIT * 0.007 * 4)  # the median of dnri's peaks
     assert fig7_noise.draw(record).axes[0].get_ylim()[1] == clean.end
     assert "clean: dnri: 1 of the runs rise above 0.112, where the scale ends." in record.notes
     assert record.table()["value"].max() == 3 * 100 * 4

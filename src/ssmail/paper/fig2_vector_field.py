@@ -58,7 +58,7 @@ BEHIND_STATISTIC = (
 )
 STEPS = 10  # of a trajectory, at which arrows stand
 TRAJECTORIES = 1  # shown
-REACH = 0.7  # how far the frame follows a policy that leaves the expert, as a share of the expert's longer side
+FRAME_WIDENING = 0.7  # at most, for a policy that leaves the expert, as a share of the expert's longer side
 MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
 TOWARDS, AWAY = "#009E73", "#CC79A7"  # colours
 ARROW = 0.03  # length, as a share of the frame's width
@@ -111,14 +111,14 @@ class VectorFieldRecord:
     def frame(self) -> tuple[float, float, float, float]:
         """Left, right, bottom and top of the trajectories, with a margin.
 
-        A policy that goes far away widens the frame by at most REACH times the expert's longer side.
+        A policy that goes far away widens the frame by at most FRAME_WIDENING times the expert's longer side.
         """
         current, expert = (
             np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in self.fields])
             for kind in ("current", "expert")
         )
         low, high = expert.min(axis=0), expert.max(axis=0)
-        reach = REACH * (high - low).max()
+        reach = FRAME_WIDENING * (high - low).max()
         seen = np.clip(current[np.isfinite(current).all(axis=1)], low - reach, high + reach)
         (left, bottom), (right, top) = (f(np.concatenate([expert, seen]), axis=0) for f in (np.min, np.max))
         margin = MARGIN * max(right - left, top - bottom)

@@ -21,10 +21,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
+from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
-from ssmail.paper.samples import LEAST, WORST, Floats, Runs, beginning_mean, end_mean
+from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance

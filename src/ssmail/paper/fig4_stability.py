@@ -23,10 +23,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
-from ssmail.paper.samples import WORST, Floats, Runs, end_mean
+from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
 from ssmail.plots.curves import Band, band, check_recorded
@@ -95,7 +96,7 @@ def collect(
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
         provenance=Provenance.of(NAME, selection.runs),
-        notes=(*selection.notes, *curve_notes.high(bands), *curve_notes.cut(bands), *curve_notes.comparisons(bands)),
+        notes=(*selection.notes, *curve_notes.of_errors(bands)),
     )
 
 

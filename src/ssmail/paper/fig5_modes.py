@@ -19,19 +19,18 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.errors import InputError
+from ssmail.data.trajectories import Floats, Integers
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection
+from ssmail.plots.run_groups import Selection, check_settled
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
@@ -56,10 +55,9 @@ BETWEEN_STATISTIC = (
     "share of agents of the test rollouts that figure 5 shows that end, along the line between the expert's two "
     "continuations of their start, nearer to its middle than to either end"
 )
-REACH = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
+FRAME_WIDENING = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
 LANE_WIDTH = 3.5  # points
 
-Floats = npt.NDArray[np.floating]
 Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
 
 
@@ -112,11 +110,9 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
     """
     selection = select(store, NAME, runs, profile)
-    for run in selection.runs:
-        if not run.state.settled:
-            raise InputError(f"run {run.name} ({run.state}) has no test rollouts; leave it out or train it to its end.")
+    check_settled(selection.runs, "test rollouts")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
-    expert = _expert(store, finished[0]) if finished else np.empty((0, 0, 0, 0, 2))
+    expert = shown_lanes(store.array(finished[0].id, LANES)) if finished else np.empty((0, 0, 0, 0, 2))
     panels = _panels(store, selection)
     return ModesRecord(
         panels=panels,
@@ -127,13 +123,9 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     )
 
 
-def _shown(starts: int) -> npt.NDArray[np.int64]:
+def _shown(starts: int) -> Integers:
     """Indices of the starts that are shown, spread over all `starts`."""
     return np.linspace(0, starts - 1, min(STARTS, starts)).round().astype(np.int64)
-
-
-def _expert(store: Store, run: RunRow) -> Floats:
-    return shown_lanes(store.array(run.id, LANES))
 
 
 def shown_lanes(lanes: Floats) -> Floats:
@@ -151,13 +143,13 @@ THINNINGS = {LANES: shown_lanes, ROLLOUTS: shown_rollouts}
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
-    """The extent of the expert, widened for rollouts that leave it by at most REACH of its larger side."""
+    """The extent of the expert, widened for rollouts that leave it by at most FRAME_WIDENING of its larger side."""
     if not rollouts:
         return (0.0, 1.0, 0.0, 1.0)
     low, high = expert.min(axis=(0, 1, 2, 3)), expert.max(axis=(0, 1, 2, 3))
     side = (high - low).max()
     shown = np.concatenate([positions.reshape(-1, 2) for positions in rollouts])
-    shown = np.clip(np.where(np.isfinite(shown), shown, low), low - REACH * side, high + REACH * side)
+    shown = np.clip(np.where(np.isfinite(shown), shown, low), low - FRAME_WIDENING * side, high + FRAME_WIDENING * side)
     low, high = np.minimum(low, shown.min(axis=0)), np.maximum(high, shown.max(axis=0))
     margin = 0.05 * side
     return (float(low[0] - margin), float(high[0] + margin), float(low[1] - margin), float(high[1] + margin))

@@ -24,15 +24,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.errors import InputError
+from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
-from ssmail.paper.samples import WORST, Floats, Runs
+from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
 from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group
+from ssmail.plots.run_groups import Group, check_settled
 from ssmail.plots.series import figure_ablation, select
 from ssmail.store import Store
 
@@ -115,6 +115,7 @@ def collect(
     """
     figure_ablation(NAME)  # without one there are no values for the axis
     selection = select(store, NAME, runs, profile)
+    check_settled(selection.runs, "test error")
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(
         columns=columns,
@@ -126,9 +127,6 @@ def collect(
 
 
 def _column(runs: Runs, group: Group, statistic: Statistic) -> Column:
-    for run in group.runs:
-        if not run.state.settled:
-            raise InputError(f"run {run.name} ({run.state}) has no test error; leave it out or train it to its end.")
     error = np.array(runs.metric(group.value, ERROR, diverged=WORST).values)
     balance = np.array(runs.metric(group.value, BALANCE, diverged=np.nan).values)
     return Column(
@@ -145,11 +143,8 @@ def _column(runs: Runs, group: Group, statistic: Statistic) -> Column:
 
 def _notes(columns: Sequence[Column]) -> list[str]:
     lost = [f"{column.label} ({column.diverged} of {len(column.error)})" for column in columns if column.diverged]
-    return (
-        [f"runs without a finite test error, of beta {', '.join(lost)}, count as infinite; a mean has no number there."]
-        if lost
-        else []
-    )
+    which = f"runs without a finite test error, of beta {', '.join(lost)}"
+    return [f"{which}, count as infinite; a mean has no number there."] * bool(lost)
 
 
 def samples(runs: Runs) -> tuple[Sample, ...]:
@@ -171,7 +166,8 @@ def draw(record: BetaRecord) -> Figure:
     with style.sheet():
         figure = style.new_figure(height=3.3)
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[2, 1])
-        style.log_axis(upper, _limits(record))
+        errors = [*(column.error for column in record.columns), np.array([record.constant_velocity or np.nan])]
+        style.log_axis(upper, style.log_limits(np.concatenate(errors)))
         upper.set_ylabel("test error, mode_mse\n(squared scaled units)")
         lower.set_ylim(-0.02, 0.52)
         lower.set_ylabel("lane_balance\n(share)")
@@ -190,12 +186,6 @@ def draw(record: BetaRecord) -> Figure:
 def _short(label: str) -> str:
     """Shorten "0.05" to ".05", to fit beside its neighbours."""
     return label.removeprefix("0") if label.startswith("0.") else label
-
-
-def _limits(record: BetaRecord) -> tuple[float, float]:
-    shown = [column.error for column in record.columns]
-    values = np.concatenate([*shown, [record.constant_velocity or np.nan]])
-    return style.log_limits(values)
 
 
 def _places(index: int, count: int) -> Floats:

@@ -10,8 +10,8 @@ given the same input.
 
 The question is whether errors grow in proportion to the step, faster or slower, so the scales are linear: on a
 logarithmic scale even the slope of a straight line seems to fall. Each panel has its own scale from 0, which ends at
-REACH times the largest typical error (medians of the runs, and constant velocity). A note reports runs that rise above
-it.
+SCALE_LIMIT times the largest typical error (medians of the runs, and constant velocity). A note reports runs that rise
+above it.
 
 The slope of a curve is that of the least-squares line through the last half of its steps (25 to 48 of 48), in squared
 scaled units per step. It is computed for each run; a method has the mean over its runs with Student's t-interval. A run
@@ -35,16 +35,17 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
 
+from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
-from ssmail.paper.samples import WORST, Floats, Runs
+from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import REFERENCE
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection
+from ssmail.plots.run_groups import Selection, check_settled
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
@@ -64,8 +65,8 @@ GROWTH = f"slope of the least-squares line through {NOISY} over all predicted st
 SPREADING = f"likewise of {SPREAD}, the standard deviation over test windows"
 LATE = f"slope of {NOISY} over the last half of the predicted steps, squared scaled units per step"
 BENDING = f"slope of {NOISY} over the last half of the predicted steps minus that over the first half"
-REACH = 4.0
-REFERENCE_REACH = 8.0
+SCALE_LIMIT = 4.0  # times the largest typical error
+REFERENCE_LIMIT = 8.0  # times the typical error of the methods; a higher reference leaves the scale
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +96,19 @@ class Panel:
     def end(self) -> float:
         """The end of the scale: just above the highest run and the reference.
 
-        It is at most REACH times the largest typical error. The reference does not count when it is so high that the
-        methods would be flat lines at the bottom.
+        It is at most SCALE_LIMIT times the largest typical error. The reference does not count when it is so high that
+        the methods would be flat lines at the bottom.
         """
         typical, highest = [float(np.median(peaks)) for peaks in self._peaks], [max(peaks) for peaks in self._peaks]
         if not self.reference_leaves:
             typical, highest = [*typical, *self.reference], [*highest, *self.reference]
-        return float(min(1.05 * max(highest, default=0), REACH * max(typical, default=0))) or 1.0
+        return float(min(1.05 * max(highest, default=0), SCALE_LIMIT * max(typical, default=0))) or 1.0
 
     @property
     def reference_leaves(self) -> bool:
         """Whether constant velocity is so much worse than the methods that it is cut off at the end of the scale."""
         typical = max((float(np.median(peaks)) for peaks in self._peaks), default=0.0)
-        return typical > 0 and max(self.reference, default=0) > REFERENCE_REACH * typical
+        return typical > 0 and max(self.reference, default=0) > REFERENCE_LIMIT * typical
 
     @property
     def _peaks(self) -> list[list[float]]:
@@ -180,10 +181,9 @@ def collect(
 
 def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
     """The section `forecast` of the specs, which states how runs are tested. Raises InputError where runs differ."""
+    check_settled(runs, "test errors")
     first = runs[0]
     for run in runs:
-        if not run.state.settled:
-            raise InputError(f"run {run.name} ({run.state}) has no test errors; leave it out or train it to its end.")
         differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"][key]]
         if differs:
             raise InputError(

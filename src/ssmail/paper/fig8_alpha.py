@@ -29,10 +29,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
-from ssmail.paper.samples import WORST, Floats, Runs, end_mean
+from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.constant_velocity import constant_velocity
 from ssmail.plots.curves import Band, band, check_recorded
@@ -111,13 +112,7 @@ def collect(
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs, kind),
         provenance=Provenance.of(NAME, selection.runs),
-        notes=(
-            *selection.notes,
-            which,
-            *curve_notes.high(errors),
-            *curve_notes.cut(errors),
-            *curve_notes.comparisons(errors),
-        ),
+        notes=(*selection.notes, which, *curve_notes.of_errors(errors)),
     )
 
 

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ssmail.config.experiments import figure_requirements
+from ssmail.data.trajectories import Floats, Integers
 from ssmail.errors import InputError
 from ssmail.plots import NoRuns, style
 from ssmail.plots.provenance import Provenance
@@ -26,9 +26,6 @@ NAME = "fig9"
 ARRAYS = ("train/expert", "train/lane", "lane_centres")
 SNAPSHOTS = 4  # time steps at which the agents are shown, including the first and the last
 MARKERS = ("o", "s", "^", "D", "v", "P")
-
-Floats = npt.NDArray[np.floating]
-Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ssmail.data.trajectories import Floats
 from ssmail.paper.claims import Sample
 from ssmail.plots import NoRuns
 from ssmail.plots.metric_units import is_error
@@ -20,7 +21,6 @@ from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
-Floats = npt.NDArray[np.float64]
 Array = npt.NDArray[Any]
 
 WORST, LEAST = np.inf, -np.inf  # what a diverged run counts as

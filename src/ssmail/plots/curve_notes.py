@@ -10,6 +10,11 @@ from ssmail.plots import style
 from ssmail.plots.curves import CEILING, Band, Curve
 
 
+def of_errors(bands: Sequence[Band]) -> tuple[str, ...]:
+    """All notes on errors over epochs."""
+    return (*high(bands), *cut(bands), *comparisons(bands))
+
+
 def cut(bands: Sequence[Band]) -> tuple[str, ...]:
     """Whose band a logarithmic scale does not show whole."""
     labels = [shown.label for shown in bands if shown.is_cut]

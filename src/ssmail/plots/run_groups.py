@@ -1,7 +1,7 @@
 """Groups of stored runs, as figures draw them, and how runs are sorted into them."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +37,13 @@ class Selection:
     def runs(self) -> tuple[RunRow, ...]:
         """Every run, group after group."""
         return tuple(run for group in self.groups for run in group.runs)
+
+
+def check_settled(runs: Iterable[RunRow], lacking: str) -> None:
+    """Raise InputError for a run that neither finished nor diverged; `lacking` is what it therefore does not have."""
+    for run in runs:
+        if not run.state.settled:
+            raise InputError(f"run {run.name} ({run.state}) has no {lacking}; leave it out or train it to its end.")
 
 
 def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:

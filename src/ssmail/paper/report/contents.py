@@ -34,21 +34,6 @@ class Report:
         return Counter(found.verdict for found in self.judgements)
 
     @property
-    def states(self) -> Counter[str]:
-        """The number of runs in each state."""
-        return Counter(run.state.value for run in self.runs)
-
-    @property
-    def seconds(self) -> float:
-        """The wall time of all runs together."""
-        return sum(run.wall_seconds for run in self.runs)
-
-    @property
-    def first(self) -> datetime:
-        """When the first run began."""
-        return min(run.started for run in self.runs)
-
-    @property
     def last(self) -> datetime:
         """When the last run ended, or last sent a heartbeat."""
         return max(run.finished or run.heartbeat for run in self.runs)
@@ -60,11 +45,6 @@ class Report:
         for run in self.runs:
             specs.setdefault(run.spec_hash, run)
         return specs
-
-    @cached_property
-    def by_id(self) -> dict[str, RunRow]:
-        """Every run by its full id."""
-        return {run.id: run for run in self.runs}
 
 
 def gather(
