@@ -41,12 +41,7 @@ class ActorCritic:
     """
 
     def __init__(
-        self,
-        spec: SacSpec,
-        actor: PolicyPredictor,
-        critic: TwinCritic,
-        generators: Generators,
-        gradient_clip: float,
+        self, spec: SacSpec, actor: PolicyPredictor, critic: TwinCritic, generators: Generators, gradient_clip: float
     ) -> None:
         self.spec, self.gradient_clip = spec, gradient_clip
         self.policy, self.critic = actor.model, critic

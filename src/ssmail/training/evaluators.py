@@ -13,13 +13,7 @@ from ssmail.config.sections import required
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
-from ssmail.evaluation.metrics import (
-    forecast_metrics,
-    lane_metrics,
-    lane_test_metrics,
-    letter_metrics,
-    one_step_mse,
-)
+from ssmail.evaluation.metrics import forecast_metrics, lane_metrics, lane_test_metrics, letter_metrics, one_step_mse
 from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
 from ssmail.training.batches import Arrays, Batch, to_numpy
 from ssmail.training.learner import LearnerContext, Predictor
