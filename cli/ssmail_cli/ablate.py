@@ -10,11 +10,12 @@ from typing import Annotated, Any
 import typer
 
 from ssmail.errors import InputError
+from ssmail.execution import Resume
 from ssmail_cli import training_options as options
 from ssmail_cli.display import note
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
-from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
+from ssmail_cli.training_options import Device, parse_seeds, pick_device
 
 
 def ablate(
@@ -37,7 +38,7 @@ def ablate(
     seeds: options.Seeds = "0-4",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
-    resume: options.ResumeOption = ResumeChoice.AUTO,
+    resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
     as_json: Json = False,
@@ -49,7 +50,7 @@ def ablate(
     ablation is an entry of experiments.yaml; `ssmail ablate-beta` is the same as `ssmail ablate beta`.
     """
     from ssmail.config.experiments import ablation, ablation_specs, display_value
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
     column = _column(ablation(name, environment).key)

@@ -14,9 +14,9 @@ from ssmail_cli.display import Format, chosen_format, note, print_rows, print_ta
 if TYPE_CHECKING:
     from ssmail.paper.needs import Needs
     from ssmail.store.maintenance.compact import Compact
-    from ssmail.store.maintenance.information import DatabaseInformation
     from ssmail.store.maintenance.merge import Merge
-    from ssmail.store.maintenance.run_contents import Difference
+    from ssmail.store.maintenance.run_rows import Difference
+    from ssmail.store.maintenance.sqlite_file import DatabaseInformation
 
 app = typer.Typer(help="Inspect, check, back up, merge and export an SQLite database.", rich_markup_mode=None)
 
@@ -32,9 +32,9 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
     The file, the revision of its schema, its size, how much of it the arrays are, and the runs by environment, method,
     profile and state. It is not upgraded.
     """
-    from ssmail.store.maintenance.information import inform
+    from ssmail.store.maintenance.sqlite_file import describe_contents
 
-    found = inform(db)
+    found = describe_contents(db)
     kind = chosen_format(as_json, None)
     rows = [asdict(count) for count in found.runs]
     if kind is Format.JSON:
@@ -213,10 +213,10 @@ def _difference(found: "Difference") -> str:
 
 
 def _merge_json(done: "Merge") -> dict[str, Any]:
-    verdicts = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.verdicts]
+    runs = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.runs]
     differences = [asdict(difference) for difference in done.differences]
     names = {"target": done.target, "other": done.other}
-    return {**names, "runs": verdicts, "differences": differences, "without_checkpoints": done.without_checkpoints}
+    return {**names, "runs": runs, "differences": differences, "without_checkpoints": done.without_checkpoints}
 
 
 def _tell(done: "Compact", needed: "Needs", others: int) -> None:

@@ -47,13 +47,13 @@ def open_store(database: str) -> "Store":
 
     Raises InputError when the file is missing: reading must not make one.
     """
-    from ssmail.store import STALE_SECONDS, Store, is_alive
+    from ssmail.store import Store
 
     if is_missing(database):
         command = "ssmail train --method ssail --profile quick --seeds 0-4"
         raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
     store = Store.open(database)
-    if not all(is_alive(row, STALE_SECONDS) for row in store.runs(state="running")):
+    if not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()
     return store

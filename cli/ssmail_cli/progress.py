@@ -11,7 +11,7 @@ from ssmail_cli.results import SHOWN, shown_on
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from ssmail.execution.local import Cell, Event
+    from ssmail.execution.cells import Cell, Event
 
 Sweep = Mapping["Cell", Mapping[str, Any]]  # what each cell is called; see ssmail_cli.sweep
 Report = Callable[["Event"], None]

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError, unknown_name
+from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import training_options as options
@@ -18,12 +19,12 @@ from ssmail_cli.progress import Sweep, label
 from ssmail_cli.report import write_report
 from ssmail_cli.reproduction_data import DataFiles, look_for_data, make_data, settled_runs, tell
 from ssmail_cli.sweep import SOME_RUNS_FAILED, Rows, compute, finish, is_interrupted, plan, result_rows
-from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
+from ssmail_cli.training_options import Device, parse_seeds, pick_device
 
 if TYPE_CHECKING:
     from ssmail.config.spec import RunSpec
     from ssmail.evaluation.statistics import Statistic
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
     from ssmail.paper.report.drawing import Drawn
     from ssmail.store import RunRow, Store
 
@@ -73,8 +74,7 @@ def reproduce(
     that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
     paths of the files. Exit code 3: some runs did not finish, or figures were left out.
     """
-    from ssmail.execution.cells import check_labels
-    from ssmail.execution.durations import longest_first
+    from ssmail.execution.planning import check_labels, longest_first
     from ssmail.store import Store
 
     given = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
@@ -98,7 +98,7 @@ def reproduce(
     make_data(figures, data, cmu)
     store = Store.open(db)
     _wait(store, sweep)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, ResumeChoice.AUTO, chosen_device))
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, chosen_device))
     if is_interrupted(rows):
         finish(sweep, rows)
     ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
@@ -117,7 +117,7 @@ def reproduce(
 
 def _wait(store: "Store", sweep: Sweep) -> None:
     """Let the processes of a reproduction that was killed a moment ago come to their end."""
-    from ssmail.execution.waiting import wait_for_others
+    from ssmail.execution.local import wait_for_others
 
     def on_wait(run: "RunRow") -> None:
         note(f"waiting up to half a minute for another process, at work or killed lately, to leave run {run.name}")
@@ -140,7 +140,7 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
 
 def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
     """The cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
     from ssmail.plots.series import figure_specs
 
     return {
@@ -161,7 +161,7 @@ def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
 
 def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
     """How long a run of each spec takes, as far as the stored runs tell."""
-    from ssmail.execution.durations import estimated_seconds
+    from ssmail.execution.planning import estimated_seconds
     from ssmail.store import Store
 
     runs = [] if is_missing(db) else Store.open(db).runs(state="finished")
@@ -198,12 +198,12 @@ def _stored(sweep: Sweep, data: DataFiles, db: str) -> "set[Cell]":
         return set()
     if data.made or data.missing:
         return set(settled_runs(Store.open(db), sweep))
-    return {cell for cell, (action, _) in plan(sweep, db, ResumeChoice.AUTO).items() if action == "skip"}
+    return {cell for cell, (action, _) in plan(sweep, db, Resume.AUTO).items() if action == "skip"}
 
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
     """The estimate of the runs of these seconds, `jobs` at a time: as a number (None: unknown) and in words."""
-    from ssmail.execution.durations import total_seconds
+    from ssmail.execution.planning import total_seconds
 
     known = [value for value in each if value is not None]
     total = total_seconds(known, jobs)

@@ -12,7 +12,7 @@ from ssmail_cli.mocap import prep_mocap
 from ssmail_cli.progress import Sweep
 
 if TYPE_CHECKING:
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
     from ssmail.store import Store
 
 MOCAP = "mocap"

@@ -76,8 +76,8 @@ def key_metrics(environments: Iterable[str]) -> dict[str, str | None]:
 
 
 def run_row(run: "RunRow") -> dict[str, Any]:
-    """The columns of a stored run by name, without its spec (long) and its owner (of no meaning to people)."""
-    return {item.name: getattr(run, item.name) for item in fields(run) if item.repr}
+    """Return the columns of a stored run by name, except the long spec and the owner, a random number."""
+    return {item.name: getattr(run, item.name) for item in fields(run) if item.name not in ("spec_json", "owner")}
 
 
 def rows_with_metrics(store: "Store", runs: "Sequence[RunRow]", names: Sequence[str]) -> list[dict[str, Any]]:

@@ -231,7 +231,7 @@ def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> Non
 
 def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] | None) -> "list[Comparison]":
     """Environment by environment, by the metrics asked for or by those of each."""
-    from ssmail.store.comparison import compare as compare_runs
+    from ssmail.store.comparison import compare_runs
 
     return [
         item

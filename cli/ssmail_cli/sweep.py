@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ssmail.errors import InputError
+from ssmail.execution import Resume
 from ssmail_cli.display import chosen_format, note, print_rows
 from ssmail_cli.options import is_missing
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.results import key_metrics, rows_with_metrics
-from ssmail_cli.training_options import ResumeChoice
 
 if TYPE_CHECKING:
-    from ssmail.execution.local import Cell, Event
+    from ssmail.execution.cells import Cell, Event
     from ssmail.store import Store
 
 SOME_RUNS_FAILED = 3
@@ -25,9 +25,9 @@ INTERRUPTED = 130
 Rows = list[dict[str, Any]]
 
 
-def train_sweep(sweep: Sweep, db: str, jobs: int, resume: ResumeChoice, device: str, as_json: bool) -> Rows:
+def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
-    from ssmail.execution.cells import check_labels
+    from ssmail.execution.planning import check_labels
     from ssmail.store import Store
 
     check_labels(sweep)  # before there is a database
@@ -37,14 +37,12 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: ResumeChoice, device: 
     return rows
 
 
-def compute(store: "Store", sweep: Sweep, jobs: int, resume: ResumeChoice, device: str) -> "list[Event]":
+def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str) -> "list[Event]":
     """Compute every cell, with its progress on stderr; the final event of each, in the order of the sweep."""
-    from ssmail.execution.local import Resume, run_cells
+    from ssmail.execution.local import run_cells
 
     with reporter(sweep) as report:
-        return run_cells(
-            list(sweep), store_url=store.url, jobs=jobs, device=device, resume=Resume(resume), on_event=report
-        )
+        return run_cells(list(sweep), store_url=store.url, jobs=jobs, device=device, resume=resume, on_event=report)
 
 
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
@@ -76,7 +74,7 @@ def finish(sweep: Sweep, rows: Rows) -> None:
         raise typer.Exit(SOME_RUNS_FAILED)
 
 
-def print_plan(sweep: Sweep, db: str, resume: ResumeChoice, as_json: bool) -> None:
+def print_plan(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
     """Print what training would do with each cell, without making a database."""
     actions = plan(sweep, db, resume)
     rows = [
@@ -87,20 +85,20 @@ def print_plan(sweep: Sweep, db: str, resume: ResumeChoice, as_json: bool) -> No
     print_rows(rows, columns, chosen_format(as_json, None))
 
 
-def plan(sweep: Sweep, db: str, resume: ResumeChoice) -> "dict[Cell, tuple[str, str | None]]":
+def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | None]]":
     """For each cell "new", "skip" or "resume", and the id of the run that there is; no database is made."""
-    from ssmail.execution.cells import Resume, Settings, check_labels, plan_cell
+    from ssmail.execution.planning import check_labels, plan_cell
     from ssmail.store import Store
 
     check_labels(sweep)
     if is_missing(db):
-        if resume is ResumeChoice.REQUIRE:
+        if resume is Resume.REQUIRE:
             raise InputError(f"there is no database {db}, so nothing to resume; use --resume auto.")
         return dict.fromkeys(sweep, ("new", None))
-    store, settings = Store.open(db), Settings(resume=Resume(resume))
+    store = Store.open(db)
     actions: dict[Cell, tuple[str, str | None]] = {}
     for cell in sweep:
-        found = plan_cell(store, cell, settings)
+        found = plan_cell(store, cell, resume)
         if found.skipped:
             actions[cell] = "skip", found.skipped.run_id
         else:

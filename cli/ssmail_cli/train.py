@@ -4,10 +4,11 @@ from typing import Annotated
 
 import typer
 
+from ssmail.execution import Resume
 from ssmail_cli import training_options as options
 from ssmail_cli.options import DEFAULT_DATABASE, Database, Json
 from ssmail_cli.sweep import finish, print_plan, train_sweep
-from ssmail_cli.training_options import Device, ResumeChoice, parse_seeds, pick_device
+from ssmail_cli.training_options import Device, parse_seeds, pick_device
 
 
 def train(
@@ -17,7 +18,7 @@ def train(
     seeds: options.Seeds = "0",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
-    resume: options.ResumeOption = ResumeChoice.AUTO,
+    resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
     as_json: Json = False,
@@ -28,7 +29,7 @@ def train(
     A run is its spec and its seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops.
     """
     from ssmail.config.experiments import build_spec
-    from ssmail.execution.local import Cell
+    from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
     spec = build_spec(method, environment, profile, settings or [])

@@ -6,16 +6,9 @@ from typing import Annotated
 import typer
 
 from ssmail.errors import InputError
+from ssmail.execution import Resume
 
 MOST_SEEDS = 1000
-
-
-class ResumeChoice(StrEnum):
-    """What to do with an unfinished run of the same spec and seed."""
-
-    AUTO = "auto"
-    NEVER = "never"
-    REQUIRE = "require"
 
 
 class Device(StrEnum):
@@ -36,7 +29,7 @@ Settings = Annotated[
     typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the spec, as sac.gamma=0.9; repeatable."),
 ]
 ResumeOption = Annotated[
-    ResumeChoice,
+    Resume,
     typer.Option("--resume", help="Continue an unfinished run: if there is one, never, or fail without one."),
 ]
 DeviceOption = Annotated[Device, typer.Option("--device", help="auto takes a GPU when there is one.")]

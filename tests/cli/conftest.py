@@ -6,14 +6,14 @@ from typing import Any
 
 import pytest
 
-from ssmail.execution import local
-from ssmail.execution.cells import Settings
-from ssmail.execution.local import Cell, Event, Resume
-from ssmail.execution.single import run_cell
+from ssmail.execution import Resume, local
+from ssmail.execution.cells import Cell, Event, RunSettings
+from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
 from ssmail_cli.main import run
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
+from tests.execution.fake_loop import Walk
 from tests.paper.handmade_arrays import arrays
 
 SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
@@ -71,10 +71,10 @@ def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     def run_cells(
         cells: Sequence[Cell], *, store_url: str, on_event: Report, jobs: int, device: str, resume: Resume
     ) -> list[Event]:
-        store, settings = Store.open(store_url), Settings(device, resume, loop_factory="tests.execution.fake_loop:Walk")
+        store, settings = Store.open(store_url), RunSettings(device, resume)
         events = []
         for cell in cells:
-            events.append(run_cell(cell, store, settings, on_event, lambda: False))
+            events.append(run_cell(cell, store, settings, on_event, lambda: False, Walk))
             on_event(events[-1])
         return events
 
@@ -83,7 +83,7 @@ def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 def _end(cell: Cell, kind: Any, store: Store, report: Report) -> Event:
     epochs = cell.spec.epochs
-    writer = store.start_run(cell.spec, cell.seed, dataset_hash="d" * 64, device="cpu", replace=True)
+    writer = store.start_run(cell.spec, cell.seed, dataset_hash="d" * 64, device="cpu", repeat=True)
     report(Event("started", cell, writer.run_id, 0, epochs))
     error = {"yjunction": "mode_mse", "letters": "stroke_distance", "mocap": "mse"}[cell.spec.environment]
     for epoch in range(1, epochs + 1):

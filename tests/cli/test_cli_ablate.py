@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ssmail.config.experiments import ablation, ablation_specs
 from ssmail.config.experiments_file import load_experiments
 from ssmail.errors import InputError
-from ssmail.execution.local import Resume
+from ssmail.execution import Resume
 from ssmail.store import Store
 from ssmail_cli.ablate import parse_values
 from ssmail_cli.progress import FEW

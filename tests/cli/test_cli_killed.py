@@ -13,13 +13,14 @@ from typing import Any
 
 import pytest
 
-from ssmail.execution.cells import Cell, Event, Settings
-from ssmail.execution.single import run_cell
+from ssmail.execution.cells import Cell, Event, RunSettings
+from ssmail.execution.run_cell import run_cell
 from ssmail.store import Store
 from ssmail.store.maintenance.checks import check
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine
 from tests.cli.test_cli_reproduce import needs
+from tests.execution.fake_loop import Driver
 
 ROOT = Path(__file__).parents[2]
 DRAW = random.Random(6)
@@ -44,8 +45,8 @@ def test_killed_ten_times_with_training_that_takes_no_time(
     cli: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run_cells(cells: Sequence[Cell], *, store_url: str, on_event: Report, device: str, **_: Any) -> list[Event]:
-        settings = Settings(device, stale_seconds=0, loop_factory="tests.execution.fake_loop:Driver")
-        return [run_cell(cell, Store.open(store_url), settings, on_event, lambda: False) for cell in cells]
+        store, settings = Store.open(store_url, stale_seconds=0), RunSettings(device)
+        return [run_cell(cell, store, settings, on_event, lambda: False, Driver) for cell in cells]
 
     monkeypatch.chdir(tmp_path)
     needs(monkeypatch, tmp_path, fig4=["ssail", "gail", "wail"])

@@ -57,7 +57,7 @@ def test_the_film_of_a_run(cli: CommandLine, run: str, where: tuple[object, ...]
     ("arguments", "sentence"),
     [
         ("landscape", "missing option '--run'."),
-        ("film --run zz", "no run has an id that begins with 'zz'"),
+        ("film --run zz", "no run id starts with 'zz'"),
         ("film --run {run} --epoch 1", "`ssmail plot film` has no option --epoch;"),
         ("fig4 --run {run}", "`ssmail plot fig4` has no option --run; did you mean --runs?"),
         ("film --run {run} --runs {run}", "`ssmail plot film` has no option --runs; did you mean --run?"),

@@ -39,7 +39,7 @@ def add(store: Store) -> AddRun:
         environment: str = "yjunction",
     ) -> str:
         spec = build_spec(method, environment, "smoke", overrides)
-        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
+        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
         for epoch in (1, 2, 3):
             losses = {"critic/loss": math.inf if epoch == 2 else 0.5}
             writer.epoch(epoch, {SHOWN[environment].validation: error * epoch, **losses})
@@ -109,7 +109,7 @@ def test_runs_are_named_by_their_first_digits(runs: CommandLine, filled: dict[st
     [
         (["list", "--state", "finishd"], "unknown state 'finishd'; did you mean finished?"),
         (["list", "--figure", "figg4"], "unknown figure 'figg4'; did you mean fig4?"),
-        (["show", "zzzz"], "no run has an id that begins with 'zzzz'"),
+        (["show", "zzzz"], "no run id starts with 'zzzz'"),
         (["compare", "--metric", "test/nothing"], "no run compared here has a metric 'test/nothing'"),
         (["export", "--format", "table"], "an export is csv or json, not a table"),
         (["export", "--out", "/proc/none.csv"], "/proc/none.csv cannot be written"),

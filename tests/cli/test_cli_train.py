@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from ssmail.errors import InputError
-from ssmail.execution import local
-from ssmail.execution.local import Resume
+from ssmail.execution import Resume, local
 from ssmail.store import Store
 from ssmail_cli.training_options import MOST_SEEDS, parse_seeds
 from tests.cli.command_line import CommandLine, FakeTraining

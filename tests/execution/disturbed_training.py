@@ -1,4 +1,4 @@
-"""Real training that something happens to; worker processes import these by name."""
+"""Real training that something happens to; tests.execution.fake_worker runs it in worker processes."""
 
 import os
 import random

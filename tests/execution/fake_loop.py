@@ -1,4 +1,4 @@
-"""Training loops that do nothing but what a test needs; worker processes import them by name."""
+"""Training loops that do nothing but what a test needs; tests.execution.fake_worker runs them in worker processes."""
 
 import math
 import os

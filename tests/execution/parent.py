@@ -3,7 +3,10 @@
 import sys
 
 from ssmail.config.experiments import build_spec
-from ssmail.execution.local import Cell, Event, run_cells
+from ssmail.execution.cells import Cell, Event
+from ssmail.execution.local import run_cells
+from tests.execution import fake_loop
+from tests.execution.fake_worker import fake_worker
 
 
 def tell(event: Event) -> None:
@@ -14,7 +17,6 @@ if __name__ == "__main__":
     where, loop, seeds, jobs = sys.argv[1:]
     spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
     cells = [Cell(spec, seed) for seed in range(int(seeds))]
-    events = run_cells(
-        cells, store_url=where, on_event=tell, jobs=int(jobs), loop_factory=f"tests.execution.fake_loop:{loop}"
-    )
+    worker = fake_worker(getattr(fake_loop, loop))
+    events = run_cells(cells, store_url=where, on_event=tell, jobs=int(jobs), worker=worker)
     print("returned", *(event.kind for event in events), flush=True)

@@ -12,17 +12,20 @@ from typing import Any
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.execution.cells import Settings
-from ssmail.execution.local import Cell, Event, Resume, run_cells
-from ssmail.execution.single import run_cell
+from ssmail.execution import Resume
+from ssmail.execution.cells import Cell, Event, RunSettings
+from ssmail.execution.local import run_cells
+from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
+from tests.execution.fake_loop import Accidents, Chatty, Endless, Patient, Walk
+from tests.execution.fake_worker import fake_worker
 from tests.execution.recorded import recorded
 
 PARENT = Path(__file__).parent / "parent.py"
 
 
 def compute(
-    store: Store, cells: Sequence[Cell], loop: str, meanwhile: Callable[[Event], None] = lambda _: None, **how: Any
+    store: Store, cells: Sequence[Cell], loop: type, meanwhile: Callable[[Event], None] = lambda _: None, **how: Any
 ) -> tuple[list[Event], list[Event]]:
     """Final events, and all events."""
     events: list[Event] = []
@@ -31,18 +34,14 @@ def compute(
         events.append(event)
         meanwhile(event)
 
-    final = run_cells(
-        cells, store_url=store.url, on_event=on_event, loop_factory=f"tests.execution.fake_loop:{loop}", **how
-    )
+    final = run_cells(cells, store_url=store.url, on_event=on_event, worker=fake_worker(loop), **how)
     return final, events
 
 
 def undisturbed(cell: Cell, folder: Path) -> tuple[Any, ...]:
     """What an uninterrupted run of the cell records."""
     store = Store.open(folder / f"undisturbed_{cell.seed}.db")
-    event = run_cell(
-        cell, store, Settings(loop_factory="tests.execution.fake_loop:Walk"), lambda _: None, lambda: False
-    )
+    event = run_cell(cell, store, RunSettings(), lambda _: None, lambda: False, Walk)
     assert event.run_id is not None
     result = recorded(store, event.run_id)
     store.close()
@@ -50,7 +49,7 @@ def undisturbed(cell: Cell, folder: Path) -> tuple[Any, ...]:
 
 
 def test_accidents_leave_other_cells_alone_and_can_be_resumed(store: Store, cells: list[Cell], tmp_path: Path) -> None:
-    final, events = compute(store, cells, "Accidents", jobs=2)
+    final, events = compute(store, cells, Accidents, jobs=2)
     assert [(event.cell.seed, event.kind, event.epoch, event.message) for event in final] == [
         (0, "finished", 4, ""),
         (1, "failed", 1, "ZeroDivisionError: planted"),
@@ -69,7 +68,7 @@ def test_accidents_leave_other_cells_alone_and_can_be_resumed(store: Store, cell
     assert {event.cell.seed for event in events[:first_end]} <= {0, 1}  # at most two at once
 
     killed = final[2].run_id
-    final, events = compute(store, cells[::2], "Walk")  # at once, not only when the killed run counts as silent
+    final, events = compute(store, cells[::2], Walk)  # at once, not only when the killed run counts as silent
     assert [event.kind for event in events] == ["skipped", "resumed", "epoch", "epoch", "epoch", "finished"]
     assert final[1].run_id == killed
     assert recorded(store, final[0].run_id) == undisturbed(cells[0], tmp_path)
@@ -80,7 +79,7 @@ def test_two_processes_at_once_of_one_thread_each_may_print_what_they_like(
     store: Store, cells: list[Cell], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MEETING_PLACE", str(tmp_path))
-    final, events = compute(store, cells[:2], "Chatty", jobs=2)
+    final, events = compute(store, cells[:2], Chatty, jobs=2)
     assert [event.kind for event in final] == ["finished", "finished"]
     epochs = [event for event in events if event.kind == "epoch"]
     assert [event.metrics["threads"] for event in epochs] == [1] * 8
@@ -95,14 +94,14 @@ def test_sigterm_interrupts_and_resuming_equals_an_undisturbed_run(
             os.kill(os.getpid(), signal.SIGTERM)
 
     before = signal.getsignal(signal.SIGTERM)
-    final, _ = compute(store, cells[:2], "Patient", stop, jobs=1)
+    final, _ = compute(store, cells[:2], Patient, stop, jobs=1)
     assert [event.kind for event in final] == ["interrupted", "interrupted"]
     assert final[0].epoch in (1, 2)  # at the end of an epoch, whichever it was in when it heard of the signal
     assert final[1].run_id is None  # the second cell never began
     (row,) = store.runs()
     assert row.state is RunState.INTERRUPTED
     assert signal.getsignal(signal.SIGTERM) is before
-    (resumed,), events = compute(store, cells[:1], "Walk")
+    (resumed,), events = compute(store, cells[:1], Walk)
     assert (events[0].kind, events[0].epoch) == ("resumed", final[0].epoch)
     assert resumed.kind == "finished"
     assert recorded(store, row.id) == undisturbed(cells[0], tmp_path)
@@ -114,7 +113,7 @@ def test_a_second_ctrl_c_kills(store: Store, cells: list[Cell]) -> None:
             os.kill(os.getpid(), signal.SIGINT)
             os.kill(os.getpid(), signal.SIGINT)
 
-    (event,), _ = compute(store, [cells[0]], "Endless", stop)
+    (event,), _ = compute(store, [cells[0]], Endless, stop)
     assert (event.kind, event.message) == ("interrupted", "its process was killed by SIGKILL")
     assert store.runs()[0].state is RunState.INTERRUPTED
 
@@ -158,13 +157,13 @@ def test_children_of_a_killed_parent_interrupt_themselves(store: Store, cells: l
 def test_a_cell_in_other_hands_is_refused_before_anything_starts(store: Store, cells: list[Cell]) -> None:
     store.start_run(cells[2].spec, 2, dataset_hash=None, device="cpu")
     with pytest.raises(InputError, match="seed 2 of this spec is being computed by another process"):
-        compute(store, cells, "Walk")
+        compute(store, cells, Walk)
     assert [row.seed for row in store.runs()] == [2]
 
 
 def test_nothing_to_resume_is_refused_before_anything_starts(store: Store, cells: list[Cell]) -> None:
     with pytest.raises(InputError, match="seed 0 of this spec has no run to resume"):
-        compute(store, cells, "Walk", resume=Resume.REQUIRE)
+        compute(store, cells, Walk, resume=Resume.REQUIRE)
     assert store.runs() == []
 
 
@@ -175,5 +174,5 @@ def test_input_that_no_process_can_begin_with_is_raised(store: Store, cells: lis
     checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(b"nothing")
     with pytest.raises(InputError, match=r"last\.pt cannot be read"):
-        compute(store, cells[:2], "Walk")
+        compute(store, cells[:2], Walk)
     assert len(store.runs()) == 1

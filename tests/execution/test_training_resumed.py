@@ -7,18 +7,22 @@ from typing import Any
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.execution.local import Cell, Event, run_cells
+from ssmail.execution.cells import Cell, Event
+from ssmail.execution.local import WORKER, run_cells
 from ssmail.store import Store
-from tests.execution.disturbed_training import LAST_EPOCH
+from ssmail.training.loop import TrainingLoop
+from tests.execution.disturbed_training import LAST_EPOCH, Interrupted, Killed
+from tests.execution.fake_worker import fake_worker
 from tests.execution.recorded import recorded
 
 EPOCHS = 5
 
 
-def train(store: Store, seeds: Sequence[int] = (0,), loop: str = "ssmail.training.loop:TrainingLoop") -> list[Event]:
+def train(store: Store, seeds: Sequence[int] = (0,), loop: type = TrainingLoop) -> list[Event]:
     spec = build_spec("ssail", "yjunction", "smoke", [f"training.epochs={EPOCHS}", "evaluation.landscapes=5"])
     cells = [Cell(spec, seed) for seed in seeds]
-    return run_cells(cells, store_url=store.url, on_event=lambda _: None, jobs=2, loop_factory=loop)
+    worker = WORKER if loop is TrainingLoop else fake_worker(loop)
+    return run_cells(cells, store_url=store.url, on_event=lambda _: None, jobs=2, worker=worker)
 
 
 def trained(where: Path, seeds: Sequence[int]) -> list[Any]:
@@ -51,11 +55,11 @@ def test_the_same_seed_gives_the_same_numbers_and_another_seed_others(tmp_path: 
 
 
 def test_killed_then_interrupted_then_resumed_equals_undisturbed(store: Store, undisturbed: Any) -> None:
-    (event,) = train(store, loop="tests.execution.disturbed_training:Killed")
+    (event,) = train(store, loop=Killed)
     assert (event.kind, event.message) == ("failed", "its process was killed by SIGKILL")
     killed_after = event.epoch
     assert LAST_EPOCH <= killed_after < EPOCHS
-    (event,) = train(store, loop="tests.execution.disturbed_training:Interrupted")
+    (event,) = train(store, loop=Interrupted)
     assert (event.kind, event.epoch) == ("interrupted", killed_after + 1)
     (event,) = train(store)
     assert event.kind == "finished"

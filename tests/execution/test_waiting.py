@@ -4,14 +4,15 @@ import threading
 import time
 
 from ssmail.execution.cells import Cell
-from ssmail.execution.waiting import wait_for_others
+from ssmail.execution.local import wait_for_others
 from ssmail.store import RunRow, RunState, Store
 
 
 def test_it_waits_until_a_run_ends_or_falls_silent_and_not_for_ever(store: Store, cells: list[Cell]) -> None:
     told: list[RunRow] = []
 
-    def waited(**limits: float) -> float:
+    def waited(stale_seconds: float, **limits: float) -> float:
+        store.stale_seconds = stale_seconds
         told.clear()
         began = time.monotonic()
         wait_for_others(store, cells[:2], told.append, **limits)

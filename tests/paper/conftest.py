@@ -41,7 +41,7 @@ def add_run(store: Store) -> AddRun:
         **extra: np.ndarray,
     ) -> str:
         spec = spec or build_spec(method, "yjunction", "smoke", overrides)
-        writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", replace=True)
+        writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", repeat=True)
         for epoch, error in enumerate(errors, start=1):
             more = {name: values[epoch - 1] for name, values in (epochs or {}).items()}
             seen = {name: values[epoch] for name, values in (looks or {}).items() if epoch in values}

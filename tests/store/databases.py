@@ -29,7 +29,7 @@ def add(
 ) -> str:
     """The id of a new run with an epoch for each error and, as far as its state allows, what a real one leaves."""
     spec = build_spec("ssail", "yjunction", "smoke", overrides)
-    writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", replace=True)
+    writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", repeat=True)
     for epoch, error in enumerate(errors, start=1):
         writer.epoch(epoch, {"validation/mode_mse": error, "actor/loss": np.inf, "seconds": seconds})
     folder = store.checkpoint_root / writer.run_id

@@ -51,7 +51,7 @@ def test_without_waiting_they_would_meet_locks(tmp_path: Path) -> None:
     """Negative control: the same load, by writers that do not wait for their turn."""
     Store.open(tmp_path / "ssmail.db").close()
     results = write_at_once(tmp_path / "ssmail.db", busy_seconds=0)
-    assert any(code == 1 and "kept the database" in last for code, last in results), results
+    assert any(code == 1 and "locked the database" in last for code, last in results), results
 
 
 CLAIM = """

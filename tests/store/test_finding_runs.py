@@ -34,10 +34,10 @@ def test_filters(store: Store, spec: RunSpec) -> None:
 def test_unknown_and_ambiguous_ids(store: Store, spec: RunSpec) -> None:
     ids = [store.start_run(spec, seed, dataset_hash=None, device="cpu").run_id for seed in range(17)]
     shared = next(digit for digit in "0123456789abcdef" if sum(run_id.startswith(digit) for run_id in ids) > 1)
-    with pytest.raises(InputError, match=f"several runs have an id that begins with '{shared}'"):
+    with pytest.raises(InputError, match=f"several run ids start with '{shared}'"):
         store.runs(ids=[shared])
     for unknown in ("zz", "%", "_", ""):
-        with pytest.raises(InputError, match="no run has an id that begins with"):
+        with pytest.raises(InputError, match="no run id starts with"):
             store.runs(ids=[unknown])
     with pytest.raises(InputError, match="there is no run zz"):
         store.resume_run("zz", 0)

@@ -139,14 +139,14 @@ def below_a_file(folder: Path) -> str:
 
 REFUSED: dict[str, tuple[Callable[[Path], str], str]] = {
     "garbage": (garbage, r"notes\.txt is not an SQLite database"),
-    "truncated": (truncated, r"cut\.db is not an SQLite database, or a damaged one"),
+    "truncated": (truncated, r"cut\.db is not an SQLite database, or is damaged"),
     "other": (of_another_program, r"other\.db is a database of another program"),
-    "newer": (newer, r"newer\.db was written by a newer ssmail \(schema 0999, .* up to 0001\); upgrade ssmail"),
+    "newer": (newer, r"newer\.db was written by a newer ssmail \(schema 0999; .* up to 0001\); upgrade ssmail"),
     "folder": (str, r"is a folder; give the path of the database file"),
     "below a file": (below_a_file, r"cannot create the folder .*file for the database"),
     "unwritable": (lambda _: "/proc/ssmail.db", r"cannot write the database /proc/ssmail\.db"),
-    "memory": (lambda _: "sqlite://", "names no file on disk"),
-    "URI": (lambda folder: f"sqlite:///file:{folder}/a.db?uri=true", "names no file on disk"),
+    "memory": (lambda _: "sqlite://", "is not a file on disk"),
+    "URI": (lambda folder: f"sqlite:///file:{folder}/a.db?uri=true", "is not a file on disk"),
     "no URL": (lambda _: "://", "neither a path nor a database URL"),
     "no dialect": (lambda _: "nosuch://host/name", r"no driver for the database URL nosuch://host/name"),
 }
@@ -185,7 +185,7 @@ def test_a_database_that_stays_locked_is_one_sentence(
     hasty = Store.open(store.where)
     holder = sqlite3.connect(store.where, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
-    with pytest.raises(SsmailError, match=r"another program kept the database .* to itself"):
+    with pytest.raises(SsmailError, match=r"another program locked the database .* for"):
         hasty.start_run(spec, 0, dataset_hash=None, device="cpu")
     assert hasty.runs() == []  # reading waits for nobody
     holder.close()

@@ -13,7 +13,7 @@ import pytest
 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
-from ssmail.store import RunRow, RunState, RunWriter, Store, is_alive
+from ssmail.store import RunRow, RunState, RunWriter, Store
 
 NOT_FINITE = {"nan": math.nan, "up": math.inf, "down": -math.inf}
 
@@ -82,7 +82,7 @@ def test_no_metrics_still_give_typed_columns(store: Store, writer: RunWriter) ->
 
 def test_a_step_is_recorded_once(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
-    with pytest.raises(SsmailError, match="already has metrics of step 1"):
+    with pytest.raises(SsmailError, match="already has metrics for step 1"):
         writer.epoch(1, {"b": 5.0, "a": 2.0})
     assert values(store, writer.run_id) == {("a", 1): 1.0}  # and nothing of the refused step
 
@@ -143,7 +143,7 @@ def test_resuming_drops_what_came_after_the_checkpoint(store: Store, writer: Run
 def test_a_checkpoint_ahead_of_the_database_is_refused(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
     writer.finish(RunState.INTERRUPTED)
-    with pytest.raises(SsmailError, match=r"checkpoint of run .* is at epoch 2 but the database ends at 1"):
+    with pytest.raises(SsmailError, match=r"checkpoint of run .* is at epoch 2 but the database ends at epoch 1"):
         store.resume_run(writer.run_id, 2)
     assert only(store).state is RunState.INTERRUPTED
     store.resume_run(writer.run_id, 1)
@@ -182,7 +182,8 @@ def test_resources_add_up_over_resumes(store: Store, writer: RunWriter) -> None:
 
 def test_who_lost_the_run_to_another_process_writes_no_more(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
-    again = store.resume_run(writer.run_id, 1, stale_seconds=0)  # the first process was silent and taken for dead
+    store.stale_seconds = 0  # the first process was silent and counts as dead
+    again = store.resume_run(writer.run_id, 1)
     with pytest.raises(SsmailError, match="resumed by another process"):
         writer.epoch(2, {"a": 666.0})
     again.epoch(2, {"a": 2.0})
@@ -190,24 +191,25 @@ def test_who_lost_the_run_to_another_process_writes_no_more(store: Store, writer
 
 
 def test_a_running_cell_is_refused_until_it_falls_silent(store: Store, spec: RunSpec, writer: RunWriter) -> None:
-    sentence = r"seed 0 of this spec is being computed by another process on .*; wait for it, or"
+    sentence = r"seed 0 of this spec is being computed by another process on .*; wait for it to end, or"
     for attempt in (
-        lambda: store.start_run(spec, 0, dataset_hash=None, device="cpu", replace=True),
+        lambda: store.start_run(spec, 0, dataset_hash=None, device="cpu", repeat=True),
         lambda: store.resume_run(writer.run_id, 0),
         lambda: store.delete([writer.run_id]),
     ):
         with pytest.raises(InputError, match=sentence):
             attempt()
     store.start_run(spec, 1, dataset_hash=None, device="cpu")  # another seed is another cell
-    store.start_run(spec, 0, dataset_hash=None, device="cpu", stale_seconds=0)
+    store.stale_seconds = 0
+    store.start_run(spec, 0, dataset_hash=None, device="cpu")
     assert [row.state for row in store.runs() if row.seed == 0] == [RunState.INTERRUPTED, RunState.RUNNING]
 
 
 def test_a_finished_cell_is_begun_again_only_on_request(store: Store, spec: RunSpec, writer: RunWriter) -> None:
     writer.finish(RunState.FINISHED)
-    with pytest.raises(InputError, match=f"is finished already, as run {writer.run_id[:8]}"):
+    with pytest.raises(InputError, match=f"has finished already, as run {writer.run_id[:8]}"):
         store.start_run(spec, 0, dataset_hash=None, device="cpu")
-    second = store.start_run(spec, 0, dataset_hash=None, device="cpu", replace=True)
+    second = store.start_run(spec, 0, dataset_hash=None, device="cpu", repeat=True)
     assert [row.id for row in store.runs()] == [writer.run_id, second.run_id]
     newest = store.find_cell(spec.hash(), 0)
     assert newest is not None
@@ -216,17 +218,21 @@ def test_a_finished_cell_is_begun_again_only_on_request(store: Store, spec: RunS
 
 
 def test_silence_is_found(store: Store, writer: RunWriter) -> None:
-    assert is_alive(only(store), 30)
-    assert store.mark_stale(30) == []
+    assert store.stale_seconds == 30
+    assert store.is_alive(only(store))
+    assert store.mark_stale() == []
     time.sleep(0.02)
-    (found,) = store.mark_stale(0.01)
+    store.stale_seconds = 0.01
+    (found,) = store.mark_stale()
     assert found.id == writer.run_id
     row = only(store)
     assert row.state is RunState.INTERRUPTED
     assert row.error is not None
     assert row.error.startswith("its process fell silent after 20")
-    assert not is_alive(row, 30)
-    assert store.mark_stale(0) == []  # it is interrupted already
+    store.stale_seconds = 30
+    assert not store.is_alive(row)
+    store.stale_seconds = 0
+    assert store.mark_stale() == []  # it is interrupted already
 
 
 def test_a_heartbeat_moves_the_last_sign_of_life(store: Store, writer: RunWriter) -> None:
@@ -254,7 +260,7 @@ def test_delete_removes_rows_and_checkpoints_of_those_runs_only(store: Store, sp
         writer.artifact("last.pt", file)
         writer.finish(RunState.FINISHED)
     gone, kept = (writer.run_id for writer in writers)
-    with pytest.raises(InputError, match="no run has an id"):
+    with pytest.raises(InputError, match="no run id starts with"):
         store.delete([gone, "zz"])
     assert len(store.runs()) == 2
     store.delete([gone[:12]])
@@ -267,6 +273,7 @@ def test_delete_removes_rows_and_checkpoints_of_those_runs_only(store: Store, sp
 
 
 def test_the_writer_of_a_deleted_run_is_told(store: Store, writer: RunWriter) -> None:
-    store.delete([writer.run_id], stale_seconds=0)
+    store.stale_seconds = 0
+    store.delete([writer.run_id])
     with pytest.raises(SsmailError, match="was deleted"):
         writer.epoch(1, {"a": 1.0})

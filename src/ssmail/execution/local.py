@@ -1,4 +1,4 @@
-"""Compute cells on this machine, each in a process of its own with one thread, some of them at once."""
+"""Computes cells on this machine, each in a worker process with one thread, several at a time."""
 
 import os
 import selectors
@@ -7,20 +7,23 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
 from ssmail.errors import InputError
-from ssmail.execution.cells import Cell, Event, Job, Kind, Resume, Settings, check_labels, plan_cell
-from ssmail.store import HEARTBEAT_SECONDS, STALE_SECONDS, RunState, Store
+from ssmail.execution import Resume
+from ssmail.execution.cells import Cell, Event, Job, Kind, RunSettings
+from ssmail.execution.planning import check_labels, plan_cell
+from ssmail.store import HEARTBEAT_SECONDS, RunRow, RunState, Store
 
-__all__ = ["Cell", "Event", "Resume", "run_cells"]
-
+WORKER = (sys.executable, "-P", "-m", "ssmail.execution.worker")
+"""The command that starts a worker process. Tests replace it to compute cells with a training loop of their own."""
 _POLL_SECONDS = 0.2
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-# glibc gives large blocks back to the system when they are freed, only to fetch and clear them again at the next step:
-# a fifth of the time of dnri on mocap. These keep them.
+# By default glibc returns large freed blocks to the system, which has to provide and clear them again at the next step;
+# for dnri on mocap that takes a fifth of the time. These settings make glibc keep them.
 _KEEP_MEMORY = {"MALLOC_MMAP_MAX_": "0", "MALLOC_TRIM_THRESHOLD_": str(2**32)}
 
 
@@ -32,61 +35,82 @@ def run_cells(
     jobs: int = 1,
     device: str = "cpu",
     resume: Resume = Resume.AUTO,
-    heartbeat_seconds: float = HEARTBEAT_SECONDS,
-    stale_seconds: float = STALE_SECONDS,
-    loop_factory: str = Settings.loop_factory,
+    worker: Sequence[str] = WORKER,
 ) -> list[Event]:
-    """Compute every cell, at most `jobs` at once, and return the final event of each, in the order of `cells`.
+    """Compute every cell, at most `jobs` at a time, and return the final event of each, in the order of `cells`.
 
-    `on_event` is called in this process with every event, final ones included. A cell that fails leaves the others
-    alone. SIGINT or SIGTERM to this process lets every running cell finish its epoch and marks it interrupted; a second
-    one kills them (their epoch is lost, nothing else). Raises InputError, and computes nothing, when another process is
-    computing one of the cells, when there is nothing to resume and `resume` is REQUIRE, when a label function is
-    broken, or when the first cell cannot begin because of its input.
+    `on_event` is called in this process with every event, including final ones. A failing cell does not affect the
+    others. After SIGINT or SIGTERM to this process, every running cell finishes its epoch and is marked interrupted; a
+    second signal kills the workers, which loses only their current epoch. Raises InputError, and computes nothing, when
+    another process is computing one of the cells, when `resume` is REQUIRE and there is nothing to resume, when a label
+    function is broken, or when the first cell cannot start because of its input.
     """
     check_labels(cells)
-    settings = Settings(device, resume, heartbeat_seconds, stale_seconds, loop_factory)
     store = Store.open(store_url)
     try:
-        plans = [plan_cell(store, cell, settings) for cell in cells]
-        pool = _Pool(store, settings, jobs, on_event)
+        plans = [plan_cell(store, cell, resume) for cell in cells]
+        pool = _Pool(store, RunSettings(device, resume), jobs, on_event, worker)
         for index, (cell, plan) in enumerate(zip(cells, plans, strict=True)):
             if plan.skipped is not None:
-                pool.tell(index, plan.skipped)
+                pool.emit(index, plan.skipped)
             else:
                 pool.waiting.append((index, cell))
-        with _signals(pool):
+        with _counted_signals(pool):
             pool.run()
         return [pool.results[index] for index in range(len(cells))]
     finally:
         store.close()
 
 
-class _Child:
-    """A worker process and what it said last."""
+def wait_for_others(
+    store: Store, cells: Iterable[Cell], on_wait: Callable[[RunRow], None], grace_seconds: float = HEARTBEAT_SECONDS
+) -> None:
+    """Wait until no process is computing any of the cells, for at most `store.stale_seconds + grace_seconds`.
 
-    def __init__(self, index: int, job: Job) -> None:
+    The workers of a command that was killed stop after their epoch. If they were killed too, they count as alive until
+    they have been silent for `store.stale_seconds`. A process that is still at work after that belongs to another
+    command, which `run_cells` reports as an error. `on_wait` is called once, with a run that is waited for.
+    """
+    waiting = list(cells)
+    deadline = time.monotonic() + store.stale_seconds + grace_seconds
+    reported = False
+    while True:
+        rows = {cell: store.find_cell(cell.spec.hash(), cell.seed) for cell in waiting}
+        alive = {cell: row for cell, row in rows.items() if row is not None and store.is_alive(row)}
+        if not alive or time.monotonic() >= deadline:
+            return
+        if not reported:
+            on_wait(next(iter(alive.values())))
+            reported = True
+        waiting = list(alive)
+        time.sleep(_POLL_SECONDS)
+
+
+class _Worker:
+    """A worker process and its last event."""
+
+    def __init__(self, index: int, job: Job, command: Sequence[str]) -> None:
         self.index, self.cell = index, job.cell
         self.last = Event("started", job.cell, None, 0, job.cell.spec.epochs)
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `wait`)
         self._buffer = b""
         self.process = subprocess.Popen(
-            [sys.executable, "-P", "-m", "ssmail.execution.worker"],
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._stderr,
             env={**os.environ, **_ONE_THREAD, **_KEEP_MEMORY},
-            start_new_session=True,  # Ctrl-C reaches only the parent, which asks its children to stop
+            start_new_session=True,  # Ctrl-C reaches only this process, which asks its workers to stop
         )
         assert self.process.stdin is not None
         assert self.process.stdout is not None
         self._stdin, self.stdout = self.process.stdin, self.process.stdout
-        with suppress(BrokenPipeError):  # it died at once: `read` will tell
+        with suppress(BrokenPipeError):  # it died immediately, which `read` reports
             self._stdin.write(job.as_line().encode() + b"\n")
             self._stdin.flush()
 
     def read(self) -> list[Event] | None:
-        """The events that have arrived; None once the process has closed its output."""
+        """Return the events that have arrived; None once the process has closed its output."""
         data = os.read(self.stdout.fileno(), 65536)
         *lines, self._buffer = (self._buffer + data).split(b"\n")
         events = [Event.from_line(line, self.cell) for line in lines]
@@ -98,94 +122,102 @@ class _Child:
             self._stdin.close()
 
     def wait(self) -> str:
-        """Wait for the end of the process; how it ended, in words."""
+        """Wait for the process to end and return a description of how it ended."""
         code = self.process.wait()
         self.ask_to_stop()
         self.stdout.close()
         with self._stderr:
             self._stderr.seek(0)
-            said = self._stderr.read().decode(errors="replace").strip().splitlines()
+            messages = self._stderr.read().decode(errors="replace").strip().splitlines()
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return f"its process {how}" + (f": {said[-1]}" if said else "")
+        return f"its process {how}" + (f": {messages[-1]}" if messages else "")
 
 
 class _Pool:
-    """Up to `jobs` children at a time."""
+    """Up to `jobs` workers at a time."""
 
-    def __init__(self, store: Store, settings: Settings, jobs: int, on_event: Callable[[Event], None]) -> None:
+    def __init__(
+        self,
+        store: Store,
+        settings: RunSettings,
+        jobs: int,
+        on_event: Callable[[Event], None],
+        command: Sequence[str],
+    ) -> None:
         self.waiting: list[tuple[int, Cell]] = []
         self.results: dict[int, Event] = {}
         self.stop_signals = 0
         self._store, self._settings, self._jobs, self._on_event = store, settings, jobs, on_event
-        self._children: list[_Child] = []
+        self._command = command
+        self._workers: list[_Worker] = []
         self._selector = selectors.DefaultSelector()
-        self._began = False
+        self._any_started = False
 
-    def tell(self, index: int, event: Event) -> None:
-        """Pass an event on, and keep it when it is final."""
+    def emit(self, index: int, event: Event) -> None:
+        """Pass an event to `on_event`, and keep it if it is final."""
         if event.is_final:
             self.results[index] = event
-        self._began = self._began or event.kind in ("started", "resumed")
+        self._any_started = self._any_started or event.kind in ("started", "resumed")
         self._on_event(event)
 
     def run(self) -> None:
-        """Compute all that waits. Whatever happens, no child is left behind."""
+        """Compute all waiting cells. Never leaves a worker behind, even after an exception."""
         try:
-            while self.waiting or self._children:
-                self._start_some()
+            while self.waiting or self._workers:
+                self._start_workers()
                 for key, _ in self._selector.select(_POLL_SECONDS):
-                    self._listen(key.data)
-                self._obey_signals()
+                    self._receive(key.data)
+                self._handle_signals()
         finally:
-            for child in self._children:
-                child.ask_to_stop()
-            for child in self._children:
-                child.wait()
+            for worker in self._workers:
+                worker.ask_to_stop()
+            for worker in self._workers:
+                worker.wait()
             self._selector.close()
 
-    def _start_some(self) -> None:
-        while self.waiting and len(self._children) < self._jobs and not self.stop_signals:
+    def _start_workers(self) -> None:
+        while self.waiting and len(self._workers) < self._jobs and not self.stop_signals:
             index, cell = self.waiting.pop(0)
-            child = _Child(index, Job(cell, self._store.url, self._settings))
-            self._children.append(child)
-            self._selector.register(child.stdout, selectors.EVENT_READ, child)
+            worker = _Worker(index, Job(cell, self._store.url, self._settings), self._command)
+            self._workers.append(worker)
+            self._selector.register(worker.stdout, selectors.EVENT_READ, worker)
 
-    def _listen(self, child: _Child) -> None:
-        events = child.read()
+    def _receive(self, worker: _Worker) -> None:
+        events = worker.read()
         for event in events or ():
-            if event.bad_input and not self._began:
+            if event.bad_input and not self._any_started:
                 raise InputError(event.message)
-            self.tell(child.index, event)
+            self.emit(worker.index, event)
         if events is None:
-            self._selector.unregister(child.stdout)
-            self._children.remove(child)
-            ended = child.wait()
-            if not child.last.is_final:
-                self._tell_of_death(child, ended)
+            self._selector.unregister(worker.stdout)
+            self._workers.remove(worker)
+            ended = worker.wait()
+            if not worker.last.is_final:
+                self._report_dead_worker(worker, ended)
 
-    def _tell_of_death(self, child: _Child, ended: str) -> None:
-        last, stopped = child.last, self.stop_signals > 0
+    def _report_dead_worker(self, worker: _Worker, ended: str) -> None:
+        last, stopped = worker.last, self.stop_signals > 0
         if last.run_id is not None:
             self._store.end_dead_run(last.run_id, RunState.INTERRUPTED if stopped else RunState.FAILED, ended)
         kind: Kind = "interrupted" if stopped else "failed"
-        self.tell(child.index, Event(kind, child.cell, last.run_id, last.epoch, last.epochs, message=ended))
+        self.emit(worker.index, Event(kind, worker.cell, last.run_id, last.epoch, last.epochs, message=ended))
 
-    def _obey_signals(self) -> None:
+    def _handle_signals(self) -> None:
         if not self.stop_signals:
             return
         for index, cell in self.waiting:
             epochs = cell.spec.epochs
-            self.tell(index, Event("interrupted", cell, None, 0, epochs, message="stopped before it began"))
+            self.emit(index, Event("interrupted", cell, None, 0, epochs, message="stopped before it started"))
         self.waiting.clear()
-        for child in self._children:
-            child.ask_to_stop()
+        for worker in self._workers:
+            worker.ask_to_stop()
             if self.stop_signals > 1:
-                child.process.kill()
+                worker.process.kill()
 
 
 @contextmanager
-def _signals(pool: _Pool) -> Iterator[None]:
-    """While the block runs, count SIGINT and SIGTERM instead of dying of them (possible in the main thread only)."""
+def _counted_signals(pool: _Pool) -> Iterator[None]:
+    """While the block runs, count SIGINT and SIGTERM instead of being ended by them (only in the main thread)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -193,9 +225,9 @@ def _signals(pool: _Pool) -> Iterator[None]:
     def count(*_: Any) -> None:
         pool.stop_signals += 1
 
-    before = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        for number, handler in before.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)

@@ -1,31 +1,36 @@
-"""The process that computes one cell for `ssmail.execution.local`: a job comes in on stdin, events go out on stdout.
+"""The worker process of `ssmail.execution.local`: reads a job from stdin, computes its cell, writes events to stdout.
 
-The end of stdin asks it to stop after the current epoch. It comes when the parent closes it, and also when the parent
-dies in whatever way, so that no process is left training behind.
+It stops after the current epoch when stdin ends. That happens when the parent closes it, but also when the parent dies
+for any reason, so that no worker goes on training.
 """
 
 import os
 import signal
 import threading
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ssmail.execution.run_cell import MakeLoop
 
 _STDIN, _STDOUT, _STDERR = 0, 1, 2
 
 
-def main() -> None:
-    """Compute the cell of the job on stdin."""
+def main(make_loop: "MakeLoop | None" = None) -> None:
+    """Compute the cell of the job on stdin with `make_loop`, by default TrainingLoop."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     events = os.fdopen(os.dup(_STDOUT), "w", buffering=1)
-    os.dup2(_STDERR, _STDOUT)  # what a library prints must not mix with the events
+    os.dup2(_STDERR, _STDOUT)  # keeps output of libraries out of the events
     line = _read_line()
     threading.Thread(target=_wait_for_end_of_stdin, args=(stop,), daemon=True).start()
 
-    import torch  # imported late: seconds in which the signals above are heard already
+    import torch  # imported late: it takes seconds, in which the signals above must be handled already
 
     from ssmail.execution.cells import Event, Job
-    from ssmail.execution.single import run_cell
+    from ssmail.execution.run_cell import run_cell
     from ssmail.store import Store
+    from ssmail.training.loop import TrainingLoop
 
     def send(event: Event) -> None:
         try:
@@ -35,16 +40,17 @@ def main() -> None:
 
     torch.set_num_threads(1)
     job = Job.from_line(line)
-    send(run_cell(job.cell, Store.open(job.store_url), job.settings, send, stop.is_set))
+    store = Store.open(job.store_url)
+    send(run_cell(job.cell, store, job.settings, send, stop.is_set, make_loop or TrainingLoop))
 
 
 def _read_line() -> bytes:
-    """The first line of stdin. Read without Python's buffers, whose lock a waiting thread would hold at exit."""
+    """Read the first line of stdin, without Python's buffers, whose lock a waiting thread would hold at exit."""
     line = b""
     while not line.endswith(b"\n"):
         byte = os.read(_STDIN, 65536)
         if not byte:
-            raise EOFError("the job on stdin ended early")
+            raise EOFError("stdin ended before the job was complete")
         line += byte
     return line
 

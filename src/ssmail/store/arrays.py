@@ -1,4 +1,4 @@
-"""NumPy arrays as rows: compressed bytes beside their dtype and shape."""
+"""Conversion of NumPy arrays to and from rows: compressed bytes with their dtype and shape."""
 
 import json
 import zlib
@@ -11,7 +11,7 @@ from ssmail.errors import SsmailError
 
 
 class EncodedArray(TypedDict):
-    """The columns of one array: `dtype` such as "<f4", `shape` as a JSON list, `data` zlib-compressed in C order."""
+    """The columns of an array: `dtype` such as "<f4", `shape` as a JSON list, `data` zlib-compressed in C order."""
 
     dtype: str
     shape: str
@@ -19,7 +19,10 @@ class EncodedArray(TypedDict):
 
 
 def encode(array: npt.NDArray[Any]) -> EncodedArray:
-    """The columns that store `array` (any shape; boolean, integer, real or complex). Raises SsmailError for others."""
+    """Return the columns for `array`, of any shape.
+
+    Raises SsmailError unless its dtype is boolean, integer, real or complex.
+    """
     if array.dtype.kind not in "biufc":
         raise SsmailError(f"an array of dtype {array.dtype} cannot be stored; make it numeric or boolean")
     return EncodedArray(
@@ -28,5 +31,5 @@ def encode(array: npt.NDArray[Any]) -> EncodedArray:
 
 
 def decode(dtype: str, shape: str, data: bytes) -> npt.NDArray[Any]:
-    """The array that `encode` stored, as a writable copy."""
+    """Return the array that `encode` stored, as a writable copy."""
     return np.frombuffer(zlib.decompress(data), dtype=np.dtype(dtype)).reshape(json.loads(shape)).copy()

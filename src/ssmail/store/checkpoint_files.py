@@ -1,4 +1,4 @@
-"""The files of checkpoints beside a database: whether they are as recorded, and how they follow their run elsewhere."""
+"""Checkpoint files beside a database: checking them against their record, and copying them in a merge."""
 
 import hashlib
 import shutil
@@ -11,17 +11,16 @@ from ssmail.errors import InputError
 from ssmail.store.queries import ArtifactRow
 
 STAGING = ".merge-"
-"""How the folder begins that holds copies until they are wanted; a merge that was killed leaves it behind."""
-PARTIAL = ".partial"
+"""Prefix of the folder that holds copies until a merge needs them; a merge that is killed leaves it behind."""
 
 
-def root_of(database: Path) -> Path:
-    """The folder of checkpoints of an SQLite file."""
+def checkpoint_root_of(database: Path) -> Path:
+    """Return the checkpoint folder of an SQLite file."""
     return database.parent / "checkpoints"
 
 
-def fault(row: ArtifactRow) -> str | None:
-    """What is wrong with a recorded file, "missing" or "altered"; None when its content is the recorded one."""
+def fault_of(row: ArtifactRow) -> str | None:
+    """Return "missing" or "altered" for a file that is not as recorded, else None."""
     try:
         if row.path.stat().st_size != row.size_bytes:
             return "altered"
@@ -32,65 +31,65 @@ def fault(row: ArtifactRow) -> str | None:
 
 
 class CheckpointCopies:
-    """Folders of checkpoints on their way from one root to another.
+    """Copies of run folders from one checkpoint root to another.
 
-    They are first copied aside (`stage`), then named as they shall be (`place`), which can be undone until `settle`.
-    Between two databases in one folder there is nothing to copy.
+    `stage` copies folders into a staging folder and `place` moves them to their final path. `undo` reverts what was
+    placed since the last `commit`. Two databases in one folder share their checkpoints, so nothing is copied.
     """
 
     def __init__(self, source: Path, target: Path) -> None:
         self.source, self.target = source, target
-        self.needless = source.resolve() == target.resolve()
+        self.shared = source.resolve() == target.resolve()
         self.staged: set[str] = set()
         self._placed: list[str] = []
         self._staging = target / f"{STAGING}{uuid.uuid4().hex[:8]}"
-        self._makes_root = not target.exists()
+        self._creates_root = not target.exists()
 
     def stage(self, run_ids: Iterable[str]) -> None:
-        """Copy the folders of these runs aside, those that exist; files that were never completed stay behind."""
+        """Copy the existing folders of these runs to the staging folder, without partially written files."""
         for run_id in run_ids:
             folder = self.source / run_id
-            if self.needless or run_id in self.staged or not folder.is_dir():
+            if self.shared or run_id in self.staged or not folder.is_dir():
                 continue
             try:
-                shutil.copytree(folder, self._staging / run_id, ignore=shutil.ignore_patterns(f"*{PARTIAL}"))
+                shutil.copytree(folder, self._staging / run_id, ignore=shutil.ignore_patterns("*.partial"))
             except (OSError, shutil.Error) as error:
                 raise InputError(f"the checkpoints in {folder} cannot be copied to {self.target}: {error}") from error
             self.staged.add(run_id)
 
     def place(self, run_ids: Iterable[str]) -> None:
-        """Give the staged folders of these runs their place; what is there already is kept aside until the end."""
+        """Move the staged folders of these runs to their final path; existing folders are kept until `close`."""
         for run_id in self.staged.intersection(run_ids):
             place = self.target / run_id
             if place.exists():
-                place.rename(self._aside(run_id))
+                place.rename(self._replaced(run_id))
             self._placed.append(run_id)
             (self._staging / run_id).rename(place)
             self.staged.discard(run_id)
 
-    def settle(self) -> None:
-        """What is placed by now stays."""
+    def commit(self) -> None:
+        """Make what has been placed so far permanent."""
         self._placed.clear()
 
     def undo(self) -> None:
-        """Take back what was placed since the last `settle`, and put back what was there."""
+        """Remove the folders placed since the last `commit` and restore those that they replaced."""
         while self._placed:
             run_id = self._placed.pop()
             shutil.rmtree(self.target / run_id, ignore_errors=True)
-            if self._aside(run_id).exists():
-                self._aside(run_id).rename(self.target / run_id)
+            if self._replaced(run_id).exists():
+                self._replaced(run_id).rename(self.target / run_id)
 
     def remove(self, run_ids: Iterable[str]) -> None:
-        """Delete the folders of runs that are no longer in the target."""
+        """Delete the folders of runs that are no longer in the target database."""
         for run_id in run_ids:
             shutil.rmtree(self.target / run_id, ignore_errors=True)
 
     def close(self) -> None:
-        """Delete what is still aside, and a folder that was made for nothing."""
+        """Delete the staging folder, and the checkpoint root if it was created for nothing."""
         shutil.rmtree(self._staging, ignore_errors=True)
-        if self._makes_root:
+        if self._creates_root:
             with suppress(OSError):
-                self.target.rmdir()  # only when it is empty
+                self.target.rmdir()  # succeeds only if the folder is empty
 
-    def _aside(self, run_id: str) -> Path:
+    def _replaced(self, run_id: str) -> Path:
         return self._staging / f"old-{run_id}"

@@ -1,4 +1,4 @@
-"""Runs side by side: grouped by everything but the seed, with mean, std and each seed's value of a metric."""
+"""Comparison of runs, grouped by spec: mean, standard deviation and per-seed values of metrics."""
 
 import math
 import statistics
@@ -17,8 +17,8 @@ class Comparison:
     """One metric over the seeds of one spec.
 
     differs: the dotted spec keys in which the compared specs differ, with this spec's values.
-    values: by seed, the metric's last value; None where the newest run of that seed recorded none.
-    states: by seed, the state of that run. No run is left out: a diverged one shows up here.
+    values: the metric's last value by seed; None if the newest run of that seed did not record it.
+    states: the state of that run by seed. Runs in every state are included, diverged ones too.
     """
 
     method: str
@@ -32,32 +32,34 @@ class Comparison:
 
     @property
     def known(self) -> list[float]:
-        """The values that are there, NaN and infinities among them."""
+        """The recorded values, including NaN and infinities."""
         return [value for value in self.values.values() if value is not None]
 
     @property
     def mean(self) -> float | None:
-        """Mean of the known values; None without one, NaN or infinite when one of them is."""
+        """Mean of the known values; None if there are none, NaN or infinite if one of them is."""
         return sum(self.known) / len(self.known) if self.known else None
 
     @property
     def std(self) -> float | None:
-        """Sample standard deviation (divisor n - 1) of the known values; None with fewer than two."""
+        """Sample standard deviation (divisor n - 1) of the known values; None if there are fewer than two."""
         if len(self.known) < 2:
             return None
         return statistics.stdev(self.known) if all(map(math.isfinite, self.known)) else math.nan
 
     @property
     def median(self) -> float | None:
-        """Median of the known values; None without one, NaN when one of them is NaN."""
+        """Median of the known values; None if there are none, NaN if one of them is NaN."""
         if any(map(math.isnan, self.known)):
             return math.nan
         return statistics.median(self.known) if self.known else None
 
 
-def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> list[Comparison]:
-    """One Comparison for each spec and metric, specs in the order of their first run; `runs` come newest last. Specs of
-    the same method and environment are told apart by what differs among them.
+def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> list[Comparison]:
+    """Return one Comparison per spec and metric, with specs in the order of their first run.
+
+    `runs` must be ordered newest last. Specs of the same method and environment are identified by the keys in which
+    they differ.
     """
     newest = {(run.spec_hash, run.seed): run for run in runs}
     specs: dict[str, list[RunRow]] = {}
@@ -73,7 +75,7 @@ def compare(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> lis
 
 
 def spec_differences(runs: Sequence[RunRow]) -> dict[str, dict[str, Any]]:
-    """By spec hash, the dotted keys in which specs of its method and environment differ, with its own values."""
+    """Return, by spec hash, the keys in which specs of its method and environment differ, with its values."""
     kinds: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for run in runs:
         kinds.setdefault((run.method, run.environment), {})[run.spec_hash] = run.spec
@@ -81,7 +83,7 @@ def spec_differences(runs: Sequence[RunRow]) -> dict[str, dict[str, Any]]:
 
 
 def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> dict[tuple[str, str], float]:
-    """The last value of each metric of the runs, by (run id, name); no entry where a run recorded none."""
+    """Return the last value of the runs' metrics by (run id, name), without entries for unrecorded metrics."""
     frame = store.latest_metrics([run.id for run in runs], metrics)
     keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
     return dict(zip(keys, frame["value"].tolist(), strict=True))
@@ -104,7 +106,7 @@ def _comparison(
 
 
 def _differences(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """For each spec, the dotted keys whose values are not the same in all of them."""
+    """Return, for each spec, the values of the dotted keys that are not the same in all specs."""
     flat = {name: flatten(spec) for name, spec in specs.items()}
     keys = sorted({key for values in flat.values() for key in values} - {"method", "environment", "profile"})
     varying = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1]

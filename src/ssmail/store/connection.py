@@ -1,7 +1,7 @@
-"""From a path or URL to an engine on a database of the current schema, and the two kinds of transaction.
+"""Engines for databases of the current schema, and their read and write transactions.
 
-SQLite is used in WAL mode: readers never wait. Writers take turns: each write transaction begins with BEGIN IMMEDIATE,
-and waits there, up to BUSY_SECONDS, so that no later statement can meet a lock.
+SQLite runs in WAL mode, so readers never wait. Writers take turns: each write transaction starts with BEGIN IMMEDIATE,
+which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock.
 """
 
 import time
@@ -21,9 +21,9 @@ _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
 def connect(where: str | Path) -> Engine:
-    """An engine on the database at `where` (a path, or an SQLAlchemy URL), created or upgraded if need be.
+    """Return an engine for the database at `where` (a path or an SQLAlchemy URL); create or upgrade it if necessary.
 
-    Raises InputError when it cannot be created or read, is no database of ssmail's, or has a newer schema.
+    Raises InputError when the database cannot be created or read, is not an ssmail database, or has a newer schema.
     """
     url = as_url(where)
     if url.get_backend_name() == "sqlite":
@@ -48,7 +48,7 @@ def connect(where: str | Path) -> Engine:
 
 @contextmanager
 def reading(engine: Engine) -> Iterator[Connection]:
-    """A connection for reading one consistent state of the database; never waits for a writer."""
+    """Yield a connection that reads one consistent state of the database; never waits for a writer."""
     try:
         with engine.connect() as connection:
             yield connection
@@ -58,7 +58,7 @@ def reading(engine: Engine) -> Iterator[Connection]:
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """A short write transaction: waits for its turn, then holds the only write lock until the block ends."""
+    """Yield a connection in a write transaction. Waits for the write lock and holds it until the block ends."""
     try:
         with engine.connect() as connection:
             connection = connection.execution_options(writes=True)
@@ -69,12 +69,12 @@ def writing(engine: Engine) -> Iterator[Connection]:
 
 
 def describe(engine: Engine) -> str:
-    """The database's path, or its URL without the password, for messages."""
+    """Return the database's path, or its URL without the password, for messages."""
     return _show(engine.url)
 
 
 def as_url(where: str | Path) -> URL:
-    """The URL of a path or URL, with the absolute path of an SQLite file. Raises InputError for what is neither."""
+    """Return the URL for a path or URL, with an absolute path for SQLite. Raises InputError when it is neither."""
     if isinstance(where, Path) or "://" not in where:
         return URL.create("sqlite", database=str(Path(where).expanduser().absolute()))
     try:
@@ -84,19 +84,19 @@ def as_url(where: str | Path) -> URL:
     if url.get_backend_name() != "sqlite":
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
-        raise InputError(f"{where!r} names no file on disk that ssmail could use; give the path of a file")
+        raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
     return url.set(database=str(Path(str(url.database)).absolute()))
 
 
 def make_engine(url: URL) -> Engine:
-    """An engine with ssmail's settings, on whatever is there: nothing is checked or upgraded."""
+    """Return an engine with ssmail's settings, without checking or upgrading the database."""
     if url.get_backend_name() != "sqlite":
         return create_engine(url, isolation_level="SERIALIZABLE")
     engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
 
     @event.listens_for(engine, "connect")
     def _configure(dbapi_connection: Any, _record: Any) -> None:
-        dbapi_connection.isolation_level = None  # the driver begins no transaction of its own: `_begin` does
+        dbapi_connection.isolation_level = None  # keeps the driver from starting transactions; `_begin` does
         dbapi_connection.execute("PRAGMA foreign_keys = ON")
 
     @event.listens_for(engine, "begin")
@@ -108,32 +108,35 @@ def make_engine(url: URL) -> Engine:
 
 
 def revision_of(connection: Connection, engine: Engine) -> str | None:
-    """The schema revision, or None in an empty database."""
+    """Return the schema revision, or None for an empty database.
+
+    Raises InputError for a database of another program or of a newer ssmail.
+    """
     tables = set(inspect(connection).get_table_names())
     if not tables:
         return None
     version_table = "alembic_version"
     if version_table not in tables or not tables & set(metadata.tables):
-        raise InputError(f"{describe(engine)} is a database of another program; give ssmail a file of its own")
+        raise InputError(f"{describe(engine)} is a database of another program; give ssmail its own file")
     revision = connection.execute(select(text("version_num")).select_from(table(version_table))).scalar()
     if revision not in REVISIONS:
         raise InputError(
-            f"{describe(engine)} was written by a newer ssmail (schema {revision}, this one knows up to "
-            f"{REVISIONS[-1]}); upgrade ssmail or use another database"
+            f"{describe(engine)} was written by a newer ssmail (schema {revision}; this version supports up "
+            f"to {REVISIONS[-1]}); upgrade ssmail or use another database"
         )
     return str(revision)
 
 
 def explained(error: BaseException | None, where: str) -> SsmailError:
-    """One sentence for what the driver of the database `where` refused."""
+    """Return an exception that explains an error of the database driver in one sentence."""
     reason = str(error)
     if "not a database" in reason or "malformed" in reason:
-        return InputError(f"{where} is not an SQLite database, or a damaged one ({reason}); give another file")
+        return InputError(f"{where} is not an SQLite database, or is damaged ({reason}); give another file")
     if "unable to open" in reason or "readonly" in reason:
         return InputError(f"cannot write the database {where} ({reason}); choose a writable place")
     if "locked" in reason:
-        return SsmailError(f"another program kept the database {where} to itself for {BUSY_SECONDS:.0f} s; close it")
-    return SsmailError(f"the database {where} refused an operation: {reason}")
+        return SsmailError(f"another program locked the database {where} for {BUSY_SECONDS:.0f} s; close that program")
+    return SsmailError(f"an operation on the database {where} failed: {reason}")
 
 
 def _show(url: URL) -> str:
@@ -155,14 +158,14 @@ def _prepare_path(url: URL) -> None:
 
 
 def _is_current(engine: Engine) -> bool:
-    """Whether the schema is the newest known one; raises InputError when this version of ssmail cannot use it."""
+    """Return whether the schema is the current one. Raises InputError when this ssmail cannot use the database."""
     with engine.connect() as connection:
         revision = revision_of(connection, engine)
     return revision == REVISIONS[-1]
 
 
 def _upgrade(engine: Engine) -> None:
-    from alembic import command  # imported here because a database is seldom upgraded, and often opened
+    from alembic import command  # imported late: most databases need no upgrade
     from alembic.config import Config
 
     if engine.dialect.name == "sqlite":
@@ -170,13 +173,13 @@ def _upgrade(engine: Engine) -> None:
     config = Config()
     config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
     with writing(engine) as connection:
-        if revision_of(connection, engine) != REVISIONS[-1]:  # another process may have been faster
+        if revision_of(connection, engine) != REVISIONS[-1]:  # another process may have upgraded it meanwhile
             config.attributes["connection"] = connection
             command.upgrade(config, "head")
 
 
 def _use_wal(engine: Engine) -> None:
-    """Switch the file to WAL mode for good. SQLite does not wait for a lock here, hence the loop."""
+    """Switch the file to WAL mode permanently. SQLite does not wait for locks here, hence the loop."""
     deadline = time.monotonic() + BUSY_SECONDS
     connection = engine.raw_connection()
     try:

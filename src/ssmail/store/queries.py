@@ -1,9 +1,9 @@
-"""Reading the store: runs, metrics as data frames, arrays, artifacts. Functions of an open connection."""
+"""Queries on an open connection: runs, metrics as data frames, arrays, artifacts."""
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
-from datetime import datetime
+from dataclasses import dataclass, fields
+from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+HEARTBEAT_SECONDS = 5.0
+"""Interval at which a running run records a heartbeat."""
+STALE_SECONDS = 30.0
+"""A running run without a heartbeat for this long counts as dead."""
+
+
 @dataclass(frozen=True)
 class RunRow:
     """One row of the table `run`; docs/database.md explains each column. Times are in UTC."""
@@ -30,7 +36,7 @@ class RunRow:
     environment: str
     profile: str
     seed: int
-    spec_json: str = field(repr=False)
+    spec_json: str
     spec_hash: str
     dataset_hash: str | None
     state: RunState
@@ -38,7 +44,7 @@ class RunRow:
     started: datetime
     finished: datetime | None
     heartbeat: datetime
-    owner: str = field(repr=False)
+    owner: str
     resumes: int
     git_commit: str | None
     git_dirty: bool | None
@@ -52,7 +58,7 @@ class RunRow:
 
     @property
     def name(self) -> str:
-        """The first eight digits of the id, enough for people."""
+        """The first eight digits of the id, for messages and tables."""
         return self.id[:8]
 
     @property
@@ -63,13 +69,22 @@ class RunRow:
 
     @cached_property
     def spec(self) -> dict[str, Any]:
-        """The run's spec as plain nested values, with what an earlier version had no key for."""
+        """The spec as nested plain values, completed with the keys that were added after the run was stored."""
         return with_added_keys(json.loads(self.spec_json))
+
+    @property
+    def silent_seconds(self) -> float:
+        """Seconds since the last heartbeat."""
+        return (datetime.now(UTC) - self.heartbeat).total_seconds()
+
+    def is_alive(self, stale_seconds: float = STALE_SECONDS) -> bool:
+        """Return whether the run is RUNNING and its last heartbeat is younger than `stale_seconds`."""
+        return self.state is RunState.RUNNING and self.silent_seconds < stale_seconds
 
 
 @dataclass(frozen=True)
 class ArtifactRow:
-    """A file that a run left behind; `path` is absolute, and the file may have been deleted since."""
+    """A file that a run recorded. `path` is absolute; the file may have been deleted since."""
 
     run_id: str
     name: str
@@ -79,24 +94,38 @@ class ArtifactRow:
 
 
 def runs(connection: Connection, *conditions: Any) -> list[RunRow]:
-    """The runs that meet all conditions, newest last."""
+    """Return the runs that meet all conditions, newest last."""
     query = select(schema.run).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
     return [_run_row(row) for row in connection.execute(query).mappings()]
 
 
+def one_run(connection: Connection, run_id: str) -> RunRow:
+    """Return the run with that full id. Raises InputError when there is none."""
+    found = runs(connection, schema.run.c.id == run_id)
+    if not found:
+        raise InputError(f"there is no run {run_id[:8]} in the database; `ssmail runs list` shows the stored runs")
+    return found[0]
+
+
+def silent_runs(connection: Connection, stale_seconds: float = STALE_SECONDS) -> list[RunRow]:
+    """Return the RUNNING runs whose last heartbeat is older than `stale_seconds`."""
+    limit = datetime.now(UTC) - timedelta(seconds=stale_seconds)
+    return runs(connection, schema.run.c.state == RunState.RUNNING, schema.run.c.heartbeat < limit)
+
+
 def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow | None:
-    """The newest run of the cell, or None."""
+    """Return the newest run of the cell, or None."""
     found = runs(connection, schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
     return found[-1] if found else None
 
 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
-    """The full id for each id or unambiguous beginning of one. Raises InputError for an unknown or ambiguous one."""
+    """Return the full id for each id or prefix of one. Raises InputError for an unknown or ambiguous prefix."""
     return [_resolve_one(connection, prefix.strip().lower()) for prefix in prefixes]
 
 
 def metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
-    """Every recorded value: run_id, seed, name, step, value; ordered by run start, name and step."""
+    """Return every recorded value: run_id, seed, name, step, value; ordered by run start, name and step."""
     table, run = schema.metric, schema.run
     query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
     query = query.join(run, run.c.id == table.c.run_id)
@@ -105,7 +134,7 @@ def metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str]
 
 
 def latest_metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
-    """The last value of each metric: run_id, name, step, value; ordered by run start and name."""
+    """Return the last value of each metric: run_id, name, step, value; ordered by run start and name."""
     table, run = schema.metric_latest, schema.run
     query = select(table.c.run_id, table.c.name, table.c.step, table.c.value, table.c.kind)
     query = query.join(run, run.c.id == table.c.run_id).order_by(run.c.started, run.c.id, table.c.name)
@@ -113,26 +142,25 @@ def latest_metrics(connection: Connection, run_ids: Sequence[str], names: Sequen
 
 
 def array(connection: Connection, run_id: str, name: str) -> npt.NDArray[Any]:
-    """The array of that name. Raises InputError, naming those there are, when the run has none."""
+    """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""
     table = schema.array
     query = select(table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run_id, table.c.name == name)
     row = connection.execute(query).one_or_none()
     if row is None:
-        there = ", ".join(array_names(connection, run_id)) or "none"
-        raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {there}")
+        existing = ", ".join(array_names(connection, run_id)) or "none"
+        raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {existing}")
     return arrays.decode(row.dtype, row.shape, row.data)
 
 
 def array_names(connection: Connection, run_id: str) -> list[str]:
-    """The names of the run's arrays, sorted."""
+    """Return the names of the run's arrays, sorted."""
     table = schema.array
-    return list(
-        connection.execute(select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)).scalars()
-    )
+    query = select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)
+    return list(connection.execute(query).scalars())
 
 
 def artifacts(connection: Connection, run_id: str, root: Path) -> list[ArtifactRow]:
-    """The run's files, by name; relative paths are taken from `root`."""
+    """Return the run's files, by name; relative paths are resolved against `root`."""
     table = schema.artifact
     query = select(table).where(table.c.run_id == run_id).order_by(table.c.name)
     return [
@@ -151,9 +179,9 @@ def _resolve_one(connection: Connection, prefix: str) -> str:
     query = select(run.c.id).where(run.c.id.startswith(prefix, autoescape=True)).limit(2)
     found = list(connection.execute(query).scalars()) if prefix else []
     if not found:
-        raise InputError(f"no run has an id that begins with {prefix!r}; `ssmail runs list` shows them")
+        raise InputError(f"no run id starts with {prefix!r}; `ssmail runs list` shows the stored runs")
     if len(found) > 1:
-        raise InputError(f"several runs have an id that begins with {prefix!r}; give more of its digits")
+        raise InputError(f"several run ids start with {prefix!r}; give more digits")
     return str(found[0])
 
 
@@ -163,7 +191,7 @@ def _selected(query: Select[Any], table: Any, run_ids: Sequence[str], names: Seq
 
 
 def _frame(connection: Connection, query: Select[Any], columns: list[str]) -> "pd.DataFrame":
-    import pandas as pd  # imported here because listing runs must not wait for it
+    import pandas as pd  # imported late so that listing runs does not wait for it
 
     rows = connection.execute(query).all()
     frame = pd.DataFrame(rows, columns=[*columns, "kind"])

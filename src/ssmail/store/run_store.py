@@ -1,20 +1,21 @@
-"""The store: one database that holds every run, its metrics and the arrays that the figures draw."""
+"""The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
 import shutil
 import uuid
 from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
-from sqlalchemy import Engine
+from sqlalchemy import Connection, Engine, delete, func, insert, select, update
 
 from ssmail.config.spec import RunSpec
-from ssmail.store import lifecycle, origin, queries, schema
-from ssmail.store.checkpoint_files import root_of
+from ssmail.errors import InputError, SsmailError
+from ssmail.store import queries, run_metadata, schema
+from ssmail.store.checkpoint_files import checkpoint_root_of
 from ssmail.store.connection import connect, describe, reading, writing
-from ssmail.store.lifecycle import STALE_SECONDS
-from ssmail.store.queries import ArtifactRow, RunRow
+from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.schema import RunState
 from ssmail.store.writer import RunWriter
 
@@ -23,27 +24,29 @@ if TYPE_CHECKING:
 
 
 class Store:
-    """An open store. Many processes may use one database at once; each opens its own Store.
+    """An open database of runs. Many processes may use the same database at once; each opens its own Store.
 
     url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
-    checkpoint_root: the folder with one subfolder of checkpoints for each run id, beside an SQLite file.
+    checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. stale_seconds: a
+    running run without a heartbeat for this long counts as dead.
     """
 
-    def __init__(self, engine: Engine) -> None:
+    def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS) -> None:
         self._engine = engine
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
+        self.stale_seconds = stale_seconds
         on_sqlite = engine.dialect.name == "sqlite"
         file = Path(str(engine.url.database)) if on_sqlite else Path("results/ssmail.db").absolute()
-        self.checkpoint_root = root_of(file)
+        self.checkpoint_root = checkpoint_root_of(file)
 
     @classmethod
-    def open(cls, where: str | Path) -> Self:
-        """The store at `where`, a path or an SQLAlchemy URL; created, or upgraded to the current schema, if need be.
+    def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS) -> Self:
+        """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
-        Raises InputError for a place that cannot be used, a file that is no database of ssmail's, and a newer schema.
+        Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        return cls(connect(where))
+        return cls(connect(where), stale_seconds)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -73,91 +76,179 @@ class Store:
             return queries.runs(connection, *conditions)
 
     def find_cell(self, spec_hash: str, seed: int) -> RunRow | None:
-        """The newest run of the cell, or None."""
+        """Return the newest run of the cell, or None."""
         with reading(self._engine) as connection:
             return queries.newest_of_cell(connection, spec_hash, seed)
 
+    def is_alive(self, row: RunRow) -> bool:
+        """Return whether a process is computing the run: it is RUNNING and has sent a heartbeat recently."""
+        return row.is_alive(self.stale_seconds)
+
+    def require_idle(self, row: RunRow) -> None:
+        """Raise InputError when another process is computing the run."""
+        if self.is_alive(row):
+            silent = max(0.0, row.silent_seconds)
+            raise InputError(
+                f"seed {row.seed} of this spec is being computed by another process on {row.host} (run {row.name}, "
+                f"last heartbeat {silent:.0f} s ago); wait for it to end, or, if it was killed, try again in "
+                f"{self.stale_seconds - silent + 1:.0f} s"
+            )
+
     def start_run(
-        self,
-        spec: RunSpec,
-        seed: int,
-        *,
-        dataset_hash: str | None,
-        device: str,
-        replace: bool = False,
-        stale_seconds: float = STALE_SECONDS,
+        self, spec: RunSpec, seed: int, *, dataset_hash: str | None, device: str, repeat: bool = False
     ) -> RunWriter:
-        """Begin a new run of the cell, in the state RUNNING, and return the hand that writes it.
+        """Insert a new run of the cell in state RUNNING and return a RunWriter for it.
 
-        Of several processes that try at once one succeeds. Raises InputError when another process is computing the
-        cell, or when it is finished or diverged already; `replace` begins a new run beside such an old one.
+        If several processes try at once, only one succeeds. Raises InputError when another process is computing the
+        cell, or when the cell has finished or diverged already, unless `repeat` allows a new run beside the old one.
         """
-        owner = uuid.uuid4().hex
-        values = {"dataset_hash": dataset_hash, "device": device, "owner": owner, **origin.columns()}
+        run_id, owner, metadata = uuid.uuid4().hex, uuid.uuid4().hex, run_metadata.columns()
         with writing(self._engine) as connection:
-            run_id = lifecycle.begin(connection, spec, seed, values, replace, stale_seconds)
-        used = {"wall_seconds": 0.0, "cpu_seconds": 0.0, "peak_memory_bytes": None}
-        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, used)
+            newest = queries.newest_of_cell(connection, spec.hash(), seed)
+            if newest is not None:
+                self.require_idle(newest)
+                if newest.state.settled and not repeat:
+                    raise InputError(
+                        f"seed {seed} of this spec has {newest.state} already, as run {newest.name}; delete it first"
+                    )
+                if newest.state is RunState.RUNNING:
+                    _interrupt(connection, newest)
+            now = datetime.now(UTC)
+            row = {
+                "id": run_id,
+                "method": spec.method,
+                "environment": spec.environment,
+                "profile": spec.profile,
+                "seed": seed,
+                "spec_json": spec.as_json(),
+                "spec_hash": spec.hash(),
+                "dataset_hash": dataset_hash,
+                "state": RunState.RUNNING,
+                "started": now,
+                "heartbeat": now,
+                "owner": owner,
+                "resumes": 0,
+                "device": device,
+                "wall_seconds": 0.0,
+                "cpu_seconds": 0.0,
+                **metadata,
+            }
+            connection.execute(insert(schema.run), row)
+        return RunWriter(self._engine, self.checkpoint_root, run_id, owner)
 
-    def resume_run(self, run_id: str, from_step: int, *, stale_seconds: float = STALE_SECONDS) -> RunWriter:
-        """Continue an unfinished run after epoch `from_step`; what it recorded later is dropped.
+    def resume_run(self, run_id: str, from_step: int) -> RunWriter:
+        """Continue an unfinished run after epoch `from_step`, dropping the metrics of later epochs.
 
-        Of several processes that try at once one succeeds. Raises InputError when another process is computing it or
-        there is no such run, SsmailError when it is finished or diverged or has recorded fewer epochs than `from_step`.
+        If several processes try at once, only one succeeds. Raises InputError when another process is computing the run
+        or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
+        `from_step`.
         """
-        values = {"owner": uuid.uuid4().hex, **origin.columns()}
+        owner, metadata = uuid.uuid4().hex, run_metadata.columns()
         with writing(self._engine) as connection:
-            row = lifecycle.resume(connection, run_id, from_step, values, stale_seconds)
-        used = {name: getattr(row, name) for name in ("wall_seconds", "cpu_seconds", "peak_memory_bytes")}
-        return RunWriter(self._engine, self.checkpoint_root, run_id, values["owner"], used)
+            row = queries.one_run(connection, run_id)
+            self.require_idle(row)
+            if row.state.settled:
+                raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
+            _drop_metrics_after(connection, row, from_step)
+            changes = {
+                "state": RunState.RUNNING,
+                "error": None,
+                "finished": None,
+                "heartbeat": datetime.now(UTC),
+                "owner": owner,
+                "resumes": row.resumes + 1,
+                **metadata,
+            }
+            connection.execute(update(schema.run).where(schema.run.c.id == run_id).values(changes))
+        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row)
 
-    def mark_stale(self, older_than_seconds: float = STALE_SECONDS) -> list[RunRow]:
-        """Mark the RUNNING runs without a heartbeat for so long as INTERRUPTED, and return them as they were found."""
+    def mark_stale(self) -> list[RunRow]:
+        """Mark the RUNNING runs without a recent heartbeat as INTERRUPTED; return their rows from before the change."""
         with writing(self._engine) as connection:
-            found = lifecycle.stale(connection, older_than_seconds)
+            found = queries.silent_runs(connection, self.stale_seconds)
             for row in found:
-                lifecycle.interrupt(connection, row)
+                _interrupt(connection, row)
         return found
 
     def end_dead_run(self, run_id: str, state: RunState, error: str) -> None:
-        """Put a RUNNING run whose process is known to be gone into `state`; a run in any other state stays as it is."""
+        """Set the state of a RUNNING run whose process is known to be dead; leave a run in any other state alone."""
         with writing(self._engine) as connection:
-            lifecycle.end(connection, run_id, state, error)
+            _end(connection, run_id, state, error)
 
-    def delete(self, run_ids: Sequence[str], *, stale_seconds: float = STALE_SECONDS) -> None:
-        """Delete the runs (ids or their beginnings), all they recorded, and their checkpoint files.
+    def delete(self, run_ids: Sequence[str]) -> None:
+        """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
 
         Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed.
         """
         with writing(self._engine) as connection:
             full = queries.resolve(connection, run_ids)
-            lifecycle.remove(connection, full, stale_seconds)
+            for run_id in full:
+                self.require_idle(queries.one_run(connection, run_id))
+            connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
         for run_id in full:
             shutil.rmtree(self.checkpoint_root / run_id, ignore_errors=True)
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
     def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
-        """Every value of the runs (full ids): columns run_id, seed, name, step, value; one row for each value."""
+        """Return every metric value of the runs (full ids): columns run_id, seed, name, step, value."""
         with reading(self._engine) as connection:
             return queries.metrics(connection, run_ids, names)
 
     def latest_metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
-        """The last value of each metric of the runs (full ids): columns run_id, name, step, value."""
+        """Return the last value of each metric of the runs (full ids): columns run_id, name, step, value."""
         with reading(self._engine) as connection:
             return queries.latest_metrics(connection, run_ids, names)
 
     def array(self, run_id: str, name: str) -> npt.NDArray[Any]:
-        """The run's array of that name. Raises InputError, naming those there are, when it has none."""
+        """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""
         with reading(self._engine) as connection:
             return queries.array(connection, run_id, name)
 
     def array_names(self, run_id: str) -> list[str]:
-        """The names of the run's arrays, sorted."""
+        """Return the names of the run's arrays, sorted."""
         with reading(self._engine) as connection:
             return queries.array_names(connection, run_id)
 
     def artifacts(self, run_id: str) -> list[ArtifactRow]:
-        """The files that the run left behind, by name."""
+        """Return the files that the run recorded, by name."""
         with reading(self._engine) as connection:
             return queries.artifacts(connection, run_id, self.checkpoint_root)
+
+
+def _interrupt(connection: Connection, row: RunRow) -> None:
+    """Mark a run whose process is silent as INTERRUPTED."""
+    error = f"its process fell silent after {row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+    _end(connection, row.id, RunState.INTERRUPTED, error)
+
+
+def _end(connection: Connection, run_id: str, state: RunState, error: str) -> None:
+    running = (schema.run.c.id == run_id) & (schema.run.c.state == RunState.RUNNING)
+    values = {"state": state, "error": error, "finished": datetime.now(UTC)}
+    connection.execute(update(schema.run).where(running).values(values))
+
+
+def _drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:
+    """Delete the run's metrics after `step` and rebuild metric_latest.
+
+    Raises SsmailError when the run has recorded fewer steps.
+    """
+    metric, latest = schema.metric, schema.metric_latest
+    connection.execute(delete(metric).where(metric.c.run_id == row.id, metric.c.step > step))
+    last = connection.execute(select(func.max(metric.c.step)).where(metric.c.run_id == row.id)).scalar() or 0
+    if last < step:
+        raise SsmailError(
+            f"the checkpoint of run {row.name} is at epoch {step} but the database ends at epoch {last}; "
+            "delete the run and train it again"
+        )
+    connection.execute(delete(latest).where(latest.c.run_id == row.id))
+    newest = (
+        select(metric.c.name, func.max(metric.c.step).label("step"))
+        .where(metric.c.run_id == row.id)
+        .group_by(metric.c.name)
+        .subquery()
+    )
+    same = (metric.c.name == newest.c.name) & (metric.c.step == newest.c.step)
+    columns = ["run_id", "name", "step", "value", "kind"]
+    rows = select(*(metric.c[column] for column in columns)).join(newest, same).where(metric.c.run_id == row.id)
+    connection.execute(insert(latest).from_select(columns, rows))

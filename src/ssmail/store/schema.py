@@ -22,11 +22,14 @@ from sqlalchemy import (
 from sqlalchemy.types import TypeDecorator
 
 REVISIONS = ("0001",)
-"""Every schema revision this version of ssmail knows, oldest first; the last is the one it reads and writes."""
+"""All schema revisions that this version of ssmail knows, oldest first; it reads and writes the last one."""
 
 
 class RunState(StrEnum):
-    """Where a run is in its life. Only a RUNNING run can be written to; INTERRUPTED and FAILED ones can be resumed."""
+    """The state of a run. Only a RUNNING run can be written to; INTERRUPTED and FAILED runs can be resumed.
+
+    Nothing sets QUEUED yet: it is part of the schema for the planned work queues, and such a run can be resumed.
+    """
 
     QUEUED = "queued"
     RUNNING = "running"
@@ -37,22 +40,22 @@ class RunState(StrEnum):
 
     @property
     def settled(self) -> bool:
-        """Whether the run has come to its end by itself: it finished or diverged, and is not trained any further."""
+        """Whether the run has finished or diverged, so that it is not trained any further."""
         return self in (RunState.FINISHED, RunState.DIVERGED)
 
 
 class UtcDateTime(TypeDecorator[datetime]):
-    """A time in UTC: stored without a zone, read and written with one."""
+    """A time in UTC, stored without a time zone but read and written with one."""
 
     impl = DateTime
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Any) -> datetime | None:
-        """The stored form of `value`, which must carry a time zone."""
+        """Convert `value`, which must have a time zone, to its stored form."""
         return None if value is None else value.astimezone(UTC).replace(tzinfo=None)
 
     def process_result_value(self, value: datetime | None, dialect: Any) -> datetime | None:
-        """The stored time, marked as UTC."""
+        """Return the stored time, marked as UTC."""
         return None if value is None else value.replace(tzinfo=UTC)
 
 

@@ -1,7 +1,7 @@
-"""Writing one run: metrics, arrays, artifacts, heartbeats and its end, in short transactions.
+"""Writes one run: metrics, arrays, artifacts, heartbeats and its final state, in short transactions.
 
-Each transaction first touches the run's row: only when the run is RUNNING and this writer still owns it does it go on.
-So a finished run cannot change, and a process that was given up for dead cannot write into the run another one resumed.
+Each transaction first updates the run's row, and continues only if the run is RUNNING and this writer still owns it. So
+a finished run cannot change, and a process that was declared dead cannot write into a run that another one resumed.
 """
 
 import hashlib
@@ -17,34 +17,42 @@ from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ssmail.errors import SsmailError
-from ssmail.store import arrays, origin, schema
+from ssmail.store import arrays, run_metadata, schema
 from ssmail.store.connection import writing
+from ssmail.store.queries import RunRow
 from ssmail.store.schema import RunState
 
 
 class RunWriter:
-    """The only hand that writes a run; get one from Store.start_run or Store.resume_run."""
+    """Records one run. Get a RunWriter from Store.start_run or Store.resume_run.
 
-    def __init__(self, engine: Engine, checkpoint_root: Path, run_id: str, owner: str, used: Mapping[str, Any]) -> None:
+    resumed: the run's row before this process resumed it; the resources in it are added to those of this process.
+    """
+
+    def __init__(
+        self, engine: Engine, checkpoint_root: Path, run_id: str, owner: str, resumed: RunRow | None = None
+    ) -> None:
         self.run_id = run_id
         self._engine = engine
         self._checkpoint_root = checkpoint_root
         self._owner = owner
-        self._used = dict(used)  # wall_seconds, cpu_seconds, peak_memory_bytes of the processes before this one
-        self._wall, self._cpu = time.monotonic(), time.process_time()
+        # clock readings at which this run's wall and CPU time would have been zero
+        self._wall_start = time.monotonic() - (resumed.wall_seconds if resumed else 0.0)
+        self._cpu_start = time.process_time() - (resumed.cpu_seconds if resumed else 0.0)
+        self._peak_memory_before = (resumed and resumed.peak_memory_bytes) or 0
 
     def epoch(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Record the metrics of epoch `step` (1-based). Raises SsmailError when one of them is recorded already."""
+        """Record the metrics of epoch `step` (1-based). Raises SsmailError when the epoch has metrics already."""
         with writing(self._engine) as connection:
             self._touch(connection)
             try:
                 _insert(connection, schema.metric, self.run_id, step, metrics)
             except IntegrityError as error:
-                raise SsmailError(f"run {self.run_id[:8]} already has metrics of step {step}") from error
+                raise SsmailError(f"run {self.run_id[:8]} already has metrics for step {step}") from error
             self._replace_latest(connection, step, metrics)
 
     def final(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Record the metrics of the final evaluation, replacing those of an evaluation that was cut short."""
+        """Record the metrics of the final evaluation, replacing those of an interrupted evaluation."""
         with writing(self._engine) as connection:
             self._touch(connection)
             _delete(connection, schema.metric, self.run_id, list(metrics))
@@ -52,17 +60,17 @@ class RunWriter:
             self._replace_latest(connection, step, metrics)
 
     def heartbeat(self) -> None:
-        """Tell the store that this run is alive. Safe to call from another thread."""
+        """Record that this run is alive. Safe to call from another thread."""
         with writing(self._engine) as connection:
             self._touch(connection)
 
     def arrays(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
-        """Store each named array, replacing one of the same name."""
+        """Store the arrays by name, replacing existing arrays of the same name."""
         rows = [{"run_id": self.run_id, "name": name, **arrays.encode(value)} for name, value in values.items()]
         self._replace(schema.array, rows)
 
     def artifact(self, name: str, path: Path) -> None:
-        """Record the file at `path` under `name`, with its SHA-256; its path is kept relative to the checkpoints."""
+        """Record the file at `path` under `name` with its SHA-256; make paths below the checkpoint root relative."""
         content = path.read_bytes()
         try:
             stored = path.resolve().relative_to(self._checkpoint_root.resolve())
@@ -73,7 +81,7 @@ class RunWriter:
         self._replace(schema.artifact, [{"run_id": self.run_id, **row}])
 
     def finish(self, state: RunState, error: str | None = None) -> None:
-        """End the run in `state`, any but QUEUED and RUNNING; after this the writer can write no more."""
+        """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards."""
         if state in (RunState.QUEUED, RunState.RUNNING):
             raise SsmailError(f"a run cannot end in the state {state}")
         with writing(self._engine) as connection:
@@ -94,9 +102,9 @@ class RunWriter:
 
     def _resources(self) -> dict[str, Any]:
         return {
-            "wall_seconds": self._used["wall_seconds"] + time.monotonic() - self._wall,
-            "cpu_seconds": self._used["cpu_seconds"] + time.process_time() - self._cpu,
-            "peak_memory_bytes": max(self._used["peak_memory_bytes"] or 0, origin.peak_memory_bytes()),
+            "wall_seconds": time.monotonic() - self._wall_start,
+            "cpu_seconds": time.process_time() - self._cpu_start,
+            "peak_memory_bytes": max(self._peak_memory_before, run_metadata.peak_memory_bytes()),
         }
 
     def _replace(self, table: Table, rows: list[dict[str, Any]]) -> None:
@@ -122,7 +130,7 @@ def _insert(connection: Connection, table: Table, run_id: str, step: int, metric
 
 
 def _value(value: float) -> dict[str, Any]:
-    """The columns value and kind: SQLite would turn NaN into NULL, and other databases refuse infinities."""
+    """Return the columns value and kind. SQLite would store NaN as NULL, and other databases reject infinities."""
     number = float(value)
     if math.isfinite(number):
         return {"value": number, "kind": "finite"}

@@ -26,7 +26,7 @@ def add_run(store: Store) -> AddRun:
         arrays: Mapping[str, np.ndarray] | None = None,
         diverged: bool = False,
     ) -> str:
-        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
+        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
         curves = epochs or {"train/mode_mse": [0.1]}
         count = len(next(iter(curves.values())))
         for epoch in range(count):

@@ -54,7 +54,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
 
 
 def add(store: Store, spec: RunSpec, seed: int, error: float, diverged: bool = False) -> None:
-    writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", replace=True)
+    writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
     for epoch in (1, 2, 3):
         writer.epoch(epoch, {"train/mode_mse": 2 * error / epoch, "validation/mode_mse": error})
     if not diverged:

@@ -13,7 +13,7 @@ from ssmail.store import RunState, Store, connection
 from ssmail.store.maintenance import backup, sqlite_file
 from ssmail.store.maintenance.backup import back_up, upgrade
 from ssmail.store.maintenance.checks import check
-from ssmail.store.maintenance.information import RunCount, inform
+from ssmail.store.maintenance.sqlite_file import RunCount, describe_contents
 from ssmail.store.schema import REVISIONS
 from tests.store.databases import SPEC, add, change, contents, files
 
@@ -175,7 +175,7 @@ def test_the_numbers_of_a_database(store: Store) -> None:
     for seed in (0, 1):
         add(store, seed)
     add(store, 2, state=RunState.DIVERGED)
-    found = inform(store.where)
+    found = describe_contents(store.where)
     assert found.runs == (
         RunCount("yjunction", "ssail", "smoke", "diverged", 1),
         RunCount("yjunction", "ssail", "smoke", "finished", 2),
@@ -192,11 +192,11 @@ def test_the_numbers_of_a_database(store: Store) -> None:
     change(store.where, "DELETE FROM array")
     change(store.where, "DELETE FROM metric")
     change(store.where, "DELETE FROM run")
-    assert inform(store.where).array_bytes == 0
+    assert describe_contents(store.where).array_bytes == 0
 
 
 def test_an_empty_file_holds_nothing(tmp_path: Path) -> None:
     (tmp_path / "empty.db").touch()
-    found = inform(tmp_path / "empty.db")
+    found = describe_contents(tmp_path / "empty.db")
     assert (found.revision, found.runs, found.size_bytes, found.array_share) == (None, (), 0, 0.0)
     assert (tmp_path / "empty.db").read_bytes() == b""

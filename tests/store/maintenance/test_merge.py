@@ -41,7 +41,7 @@ def fates(here: Store, there: Store) -> list[Fate]:
     """Of a merge of `there` into `here`, by seed."""
     done = merge(here.where, there.where)
     assert done.without_checkpoints == ()
-    return [item.fate for item in sorted(done.verdicts, key=lambda item: item.run.seed)]
+    return [item.fate for item in sorted(done.runs, key=lambda item: item.run.seed)]
 
 
 def test_new_cells_are_added_with_all_they_recorded(here: Store, there: Store) -> None:
@@ -193,7 +193,7 @@ def test_merging_into_nothing_copies_and_merging_twice_is_merging_once(runs: lis
         once = contents(copy), files(copy.parent / "checkpoints")
         again = merge(copy, two.where)
         assert (contents(copy), files(copy.parent / "checkpoints")) == once
-        assert not any(verdict.enters for verdict in again.verdicts)
+        assert not any(item.enters for item in again.runs)
         assert check(copy) == []
         one.close()
         two.close()
@@ -224,12 +224,12 @@ def clear_folders(store: Store) -> None:
             shutil.rmtree(store.checkpoint_root / problem.subject)
 
 
-@pytest.mark.parametrize("place", ["carry", "stage", "place"])
+@pytest.mark.parametrize("place", ["copy_run", "stage", "place"])
 def test_a_failure_leaves_everything_as_it_was(
     place: str, rivals: list[str], here: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = contents(here.where), files(here.checkpoint_root)
-    owner = module if place == "carry" else CheckpointCopies
+    owner = module if place == "copy_run" else CheckpointCopies
     real, calls = getattr(owner, place), []
 
     def fails(*arguments: object) -> object:
@@ -269,7 +269,7 @@ merging.merge(sys.argv[1], sys.argv[2])
 """
 
 
-@pytest.mark.parametrize("moment", [("files", "stage", "2"), ("merging", "carry", "3"), ("files", "settle", "1")])
+@pytest.mark.parametrize("moment", [("files", "stage", "2"), ("merging", "copy_run", "3"), ("files", "commit", "1")])
 def test_a_merge_that_is_killed_leaves_the_target_as_it_was(
     moment: tuple[str, str, str], rivals: list[str], here: Store
 ) -> None:
@@ -279,7 +279,7 @@ def test_a_merge_that_is_killed_leaves_the_target_as_it_was(
     assert killed.returncode == -signal.SIGKILL
     problems = {problem.check for problem in check(here.where)}
     assert problems <= {"folders"}
-    if moment[1] != "settle":
+    if moment[1] != "commit":
         assert contents(here.where) == before
     merge(*rivals)
     clear_folders(here)
@@ -315,7 +315,7 @@ def test_an_older_schema_is_one_sentence_with_the_remedy(
     for owner in (connection, sqlite_file):
         monkeypatch.setattr(owner, "REVISIONS", ("0001", "0002"))
     sentence = (
-        rf"has schema 0001, and this ssmail reads 0002; upgrade it first with `ssmail db upgrade --db {there.where}`"
+        rf"has schema 0001, but this ssmail reads 0002; upgrade it first with `ssmail db upgrade --db {there.where}`"
     )
     with pytest.raises(InputError, match=sentence):
         merge(here.where, there.where)

@@ -1,1 +1,1 @@
-"""Looking after a database: checks, backup, merge, compact copies."""
+"""Maintenance of SQLite databases: checks, backup, merge, compact export."""

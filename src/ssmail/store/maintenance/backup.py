@@ -1,4 +1,4 @@
-"""A copy of a database that may be in use, through SQLite's own backup; and an upgrade with such a copy made first."""
+"""Backups of databases that may be in use, and upgrades that make a backup first."""
 
 import sqlite3
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ssmail.store.schema import REVISIONS
 
 @dataclass(frozen=True)
 class Upgrade:
-    """What an upgrade did. `backup` is the copy of the old state; None when there was nothing to upgrade or to keep."""
+    """What an upgrade did. `backup` is a copy of the old state; None if there was nothing to upgrade or keep."""
 
     path: Path
     before: str | None
@@ -24,9 +24,9 @@ class Upgrade:
 def back_up(where: str | Path, target: Path) -> int:
     """Copy the database to the new file `target` and return its size in bytes.
 
-    Safe at any time: the copy is the database as it is at one moment, whatever writers do; no one waits. Checkpoints,
-    which are files beside the database, are not copied. Raises InputError when `target` exists, cannot be written, or
-    when `where` is damaged or no database of ssmail's.
+    The copy is one consistent state of the database, even while runs are written, and makes no writer wait. Checkpoint
+    files are not copied. Raises InputError when `target` exists or cannot be written, or when `where` is damaged or not
+    an ssmail database.
     """
     path = existing(where)
     revision(path)
@@ -39,9 +39,9 @@ def back_up(where: str | Path, target: Path) -> int:
 
 
 def upgrade(where: str | Path) -> Upgrade:
-    """Bring the tables of the database to the newest schema, in one transaction, with a backup beside it first.
+    """Back up the database beside the file, then upgrade it to the newest schema in one transaction.
 
-    Raises InputError for a file that ssmail cannot use; then nothing has changed.
+    Raises InputError, and changes nothing, when ssmail cannot use the file.
     """
     path = existing(where)
     before = revision(path)
@@ -54,7 +54,7 @@ def upgrade(where: str | Path) -> Upgrade:
 
 
 def _copy(path: Path, partial: Path) -> None:
-    """All pages in one step, which is one read transaction; then a look at whether the copy is sound."""
+    """Copy all pages in one read transaction, and check that the copy is intact."""
     source = sqlite3.connect(path, timeout=BUSY_SECONDS)
     copy = sqlite3.connect(partial)
     try:
@@ -65,4 +65,4 @@ def _copy(path: Path, partial: Path) -> None:
         copy.close()
         source.close()
     if damage != "ok":
-        raise InputError(f"{path} is damaged ({damage}) and was not copied; `ssmail db check` tells more")
+        raise InputError(f"{path} is damaged ({damage}) and was not copied; run `ssmail db check` for details")

@@ -1,4 +1,4 @@
-"""What is wrong with a database and the checkpoints beside it, each problem with its remedy. Nothing is changed."""
+"""Checks of a database and its checkpoints. Every problem comes with a remedy; nothing is changed."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,23 +10,22 @@ from sqlalchemy.exc import DBAPIError
 
 from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError
-from ssmail.store import arrays, lifecycle, queries, schema
-from ssmail.store.checkpoint_files import STAGING, fault, root_of
+from ssmail.store import arrays, queries, schema
+from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
 from ssmail.store.connection import revision_of
-from ssmail.store.lifecycle import STALE_SECONDS
 from ssmail.store.maintenance.sqlite_file import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
 
 FINAL = "test"
-"""How the names of final metrics begin."""
-_MOST = 20  # problems of one kind that SQLite itself is asked for
+"""Prefix of the names of final metrics."""
+_MOST = 20  # problems reported by SQLite's integrity check
 _DATABASE = b"SQLite format 3\x00"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """`check` names the kind, `subject` what it is about (a run's id, a table, a folder); the others are for people."""
+    """A problem of the kind `check` with `subject` (a run id, a table or a folder), and two sentences for the user."""
 
     check: str
     subject: str
@@ -34,40 +33,37 @@ class Problem:
     remedy: str
 
 
-def check(where: str | Path, *, stale_seconds: float = STALE_SECONDS) -> list[Problem]:
-    """Every problem of an SQLite database, none when it is sound; safe while runs are being computed.
+def check(where: str | Path) -> list[Problem]:
+    """Return all problems of an SQLite database. Safe while runs are being computed.
 
-    Raises InputError for a file that is missing, no SQLite database, another program's or of a newer ssmail.
+    Raises InputError when the file is missing, is not an ssmail database, or is from a newer ssmail.
     """
     path = existing(where)
-    folders = _checkpoint_folders(path)  # before the runs are read: a run has its row before its folder
+    folders = _checkpoint_folders(path)  # read before the runs, because a run has its row before its folder
     try:
         with opened(path) as engine, engine.connect() as connection:
-            return list(_problems(path, connection, revision_of(connection, engine), folders, stale_seconds))
+            return list(_problems(path, connection, revision_of(connection, engine), folders))
     except DBAPIError as error:
         if "not a database" in str(error.orig):
             raise InputError(f"{path} is not an SQLite database ({error.orig}); give another file") from error
         return [_damage(path, str(error.orig))]
 
 
-def _problems(
-    path: Path, connection: Connection, revision: str | None, folders: Sequence[Path], stale_seconds: float
-) -> Iterator[Problem]:
+def _problems(path: Path, connection: Connection, revision: str | None, folders: Sequence[Path]) -> Iterator[Problem]:
     damage = connection.exec_driver_sql(f"PRAGMA integrity_check({_MOST})").scalars().all()
     if damage != ["ok"]:
         yield from (_damage(path, str(line)) for line in damage)
         return
     if revision != REVISIONS[-1]:
-        found = (
-            "it has no tables yet" if revision is None else f"its schema is {revision}, and {REVISIONS[-1]} is current"
-        )
+        old = f"its schema is {revision}, but {REVISIONS[-1]} is current"
+        found = "it has no tables yet" if revision is None else old
         yield Problem("schema", path.name, found, f"run `ssmail db upgrade --db {path}`, then check again")
         return
     yield from _orphans(path, connection)
     runs = queries.runs(connection)
     for examine in (_spec, _final_metrics, _unreadable_arrays, _stale_latest):
         yield from (problem for run in runs for problem in examine(connection, run))
-    yield from _silent(connection, stale_seconds)
+    yield from _silent(connection)
     yield from _checkpoints(path, connection, runs)
     yield from _stray_folders(path, folders, {run.id for run in runs})
 
@@ -78,7 +74,7 @@ def _damage(path: Path, reason: str) -> Problem:
 
 
 def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
-    """Rows that belong to no run, counted by table."""
+    """Find rows that belong to no run, counted by table."""
     rows = connection.exec_driver_sql("PRAGMA foreign_key_check").all()
     tables = [row[0] for row in rows]
     for name in sorted(set(tables)):
@@ -89,17 +85,17 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
 
 
 def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
-    """The hash must be that of the spec."""
+    """Check that the stored hash is that of the spec."""
     try:
         found = spec_hash(run.spec)
-    except (ValueError, TypeError, AttributeError):  # no JSON, or not that of a spec
+    except (ValueError, TypeError, AttributeError):  # the text is not JSON, or not a spec
         found = None
     if found != run.spec_hash:
         yield Problem("spec", run.id, f"the spec of run {run.name} does not have the hash {run.spec_hash}", _again(run))
 
 
 def _final_metrics(connection: Connection, run: RunRow) -> Iterator[Problem]:
-    """A finished run has been evaluated."""
+    """Check that a finished run has final metrics."""
     latest = schema.metric_latest
     query = select(func.count()).where(latest.c.run_id == run.id, latest.c.name.startswith(FINAL))
     if run.state is RunState.FINISHED and connection.execute(query).scalar_one() == 0:
@@ -112,13 +108,13 @@ def _unreadable_arrays(connection: Connection, run: RunRow) -> Iterator[Problem]
     for name, *columns in connection.execute(query):
         try:
             arrays.decode(*columns)
-        except Exception as error:  # of zlib, JSON or NumPy
+        except Exception as error:  # from zlib, JSON or NumPy
             found = f"the array {name} of run {run.name} cannot be read ({error})"
             yield Problem("arrays", run.id, found, _again(run))
 
 
 def _stale_latest(connection: Connection, run: RunRow) -> Iterator[Problem]:
-    """metric_latest must repeat the last row of each metric."""
+    """Check that metric_latest holds the last value of each metric."""
     columns = ("name", "step", "value", "kind")
     metric, latest = schema.metric, schema.metric_latest
     query = select(*(metric.c[key] for key in columns)).where(metric.c.run_id == run.id).order_by(metric.c.step)
@@ -127,33 +123,33 @@ def _stale_latest(connection: Connection, run: RunRow) -> Iterator[Problem]:
     shown = {row.name: tuple(row) for row in connection.execute(query)}
     wrong = sorted(name for name in last.keys() | shown.keys() if last.get(name) != shown.get(name))
     if wrong:
-        found = f"the last value of {wrong[0]} of run {run.name} is not what the table metric_latest says"
+        found = f"the last value of {wrong[0]} of run {run.name} differs from the one in the table metric_latest"
         yield Problem("latest metrics", run.id, found, _again(run))
 
 
-def _silent(connection: Connection, stale_seconds: float) -> Iterator[Problem]:
-    for run in lifecycle.stale(connection, stale_seconds):
-        found = f"run {run.name} is running but gave its last sign of life at {run.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
-        remedy = "train it again to continue it, or list the runs (`ssmail runs list`) to mark it interrupted"
+def _silent(connection: Connection) -> Iterator[Problem]:
+    for run in queries.silent_runs(connection):
+        found = f"run {run.name} is running, but its last heartbeat was at {run.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+        remedy = "train it again to resume it, or run `ssmail runs list`, which marks it as interrupted"
         yield Problem("stale", run.id, found, remedy)
 
 
 def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> Iterator[Problem]:
-    """The recorded files must be there, with the recorded content."""
+    """Check that the recorded files exist with the recorded content."""
     for run in runs:
-        for row in queries.artifacts(connection, run.id, root_of(path)):
-            if wrong := fault(row):
+        for row in queries.artifacts(connection, run.id, checkpoint_root_of(path)):
+            if wrong := fault_of(row):
                 remedy = f"copy it from a backup to {row.path}, or {_again(run)}"
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 
 def _stray_folders(path: Path, folders: Sequence[Path], here: set[str]) -> Iterator[Problem]:
-    """Folders of checkpoints that belong to no run, of this database or another one in the same folder."""
+    """Find checkpoint folders that belong to no run of this database or of others in the same folder."""
     strays = [folder for folder in folders if folder.name not in here]
     known = set().union(*map(_run_ids, _neighbours(path))) if strays else set()
     for folder in strays:
         if folder.name.startswith(STAGING):
-            found = f"{folder} is left over from a merge that was killed, or of one at work"
+            found = f"{folder} belongs to a merge that is running or was killed"
         elif folder.name not in known:
             found = f"the checkpoints in {folder} belong to no run"
         else:
@@ -162,27 +158,27 @@ def _stray_folders(path: Path, folders: Sequence[Path], here: set[str]) -> Itera
 
 
 def _checkpoint_folders(path: Path) -> list[Path]:
-    """Those named after a run, and those that a merge works in."""
-    root = root_of(path)
+    """Return the folders named after a run id, and the staging folders of merges."""
+    root = checkpoint_root_of(path)
     named = re.compile(rf"[0-9a-f]{{32}}|{re.escape(STAGING)}.*")
     return sorted(folder for folder in root.iterdir() if named.fullmatch(folder.name)) if root.is_dir() else []
 
 
 def _neighbours(path: Path) -> list[Path]:
-    """The other SQLite files in the folder: they have the same folder of checkpoints."""
+    """Return the other SQLite files in the folder, which share the checkpoint folder."""
 
-    def begins_as_one(file: Path) -> bool:
+    def is_sqlite(file: Path) -> bool:
         try:
             with file.open("rb") as content:
                 return content.read(len(_DATABASE)) == _DATABASE
         except OSError:
             return False
 
-    return [file for file in path.parent.iterdir() if file != path and file.is_file() and begins_as_one(file)]
+    return [file for file in path.parent.iterdir() if file != path and file.is_file() and is_sqlite(file)]
 
 
 def _run_ids(path: Path) -> set[str]:
-    """The ids of its runs; none when it is no database of ssmail's."""
+    """Return the ids of the runs in the file; empty if it is not an ssmail database."""
     try:
         with opened(path) as engine, engine.connect() as connection:
             return set(connection.execute(select(schema.run.c.id)).scalars())

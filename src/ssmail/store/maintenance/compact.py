@@ -1,30 +1,30 @@
-"""A small database with what figures need of some runs: every column and every last value, some curves, some arrays."""
+"""Export of a small database: runs with all columns and last values, but only the curves and arrays that are wanted."""
 
 import sqlite3
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Table, func, insert, select
+from sqlalchemy import Connection, Table, func, select, update
 
-from ssmail.store import arrays, schema
+from ssmail.store import arrays, queries, schema
 from ssmail.store.connection import connect, reading, writing
+from ssmail.store.maintenance.run_rows import copy_rows
 from ssmail.store.maintenance.sqlite_file import existing, new_file, opened, require_current
 from ssmail.store.queries import RunRow
 
 Thinning = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
-"""Makes of an array the part that is wanted of it."""
-_ROWS = 500  # at a time
+"""Reduces an array to the part that is wanted."""
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What to keep beside the runs and their last values.
+    """What to keep in addition to the runs and their last values.
 
-    curves: names of metrics that keep every epoch; any other keeps its last value alone. arrays: by run id the names of
-    arrays, each with what thins it, or None to keep it whole.
+    curves: names of the metrics to keep for every epoch. arrays: for each run id, the names of the arrays to keep, with
+    a Thinning, or None to keep the array whole.
     """
 
     curves: Collection[str]
@@ -33,30 +33,31 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Compact:
-    """What was written, and what was left out of the chosen runs."""
+    """What was written, and what was left out of the exported runs."""
 
     path: Path
     size_bytes: int
     runs: int
     metrics: int  # rows
     arrays: int
-    thinned: int  # arrays of which a part was kept
+    thinned: int  # arrays of which only a part was kept
     left_out_metrics: int
     left_out_arrays: int
     left_out_artifacts: int
 
 
 def settled_cells(runs: Sequence[RunRow]) -> list[RunRow]:
-    """The newest finished or diverged run of each spec, seed and data, in the given order (newest last)."""
+    """Return the newest finished or diverged run of each spec, seed and data; `runs` must be ordered newest last."""
     newest = {(run.spec_hash, run.seed, run.dataset_hash): run for run in runs if run.state.settled}
     return [run for run in runs if newest.get((run.spec_hash, run.seed, run.dataset_hash)) is run]
 
 
 def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], wanted: Wanted) -> Compact:
-    """Write these runs to the new database `target`, without checkpoints; one that needs no second file to be read.
+    """Write these runs to the new database `target`, without checkpoints.
 
-    A death at any moment leaves no `target`. Raises InputError when it exists or cannot be written, and for a database
-    that is missing, damaged or of another schema.
+    The file is not in WAL mode, so reading it creates no second file. If the process dies at any moment there is no
+    `target`. Raises InputError when `target` exists or cannot be written, or when the database is missing, damaged or
+    of another schema.
     """
     source = existing(where)
     require_current(source)
@@ -65,7 +66,7 @@ def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], want
         try:
             with opened(source) as theirs, reading(theirs) as there, writing(engine) as here:
                 for run in runs:
-                    _carry(there, here, run, wanted)
+                    _copy_run(there, here, run, wanted)
                 report = _counts(there, here, runs)
         finally:
             engine.dispose()
@@ -76,7 +77,7 @@ def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], want
 
 
 def _shrink(path: Path) -> None:
-    """Give back unused pages, and leave WAL mode: one file, which reading does not touch."""
+    """Free unused pages and leave WAL mode."""
     connection = sqlite3.connect(path, isolation_level=None)
     try:
         connection.execute("PRAGMA journal_mode = DELETE")
@@ -85,32 +86,20 @@ def _shrink(path: Path) -> None:
         connection.close()
 
 
-def _carry(there: Connection, here: Connection, run: RunRow, wanted: Wanted) -> None:
-    columns = there.execute(select(schema.run).where(schema.run.c.id == run.id)).mappings().one()
-    here.execute(insert(schema.run), dict(columns))
-    for table in (schema.metric, schema.metric_latest):
-        for rows in _metrics(there, run.id, table, wanted.curves):
-            here.execute(insert(table), rows)
+def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted) -> None:
+    metric, latest, array = schema.metric, schema.metric_latest, schema.array
+    copy_rows(there, here, schema.run, schema.run.c.id == run.id)
+    last = select(latest.c.name).where(
+        latest.c.run_id == run.id, latest.c.name == metric.c.name, latest.c.step == metric.c.step
+    )
+    kept = metric.c.name.in_(list(wanted.curves)) | last.exists()
+    copy_rows(there, here, metric, metric.c.run_id == run.id, kept)
+    copy_rows(there, here, latest, latest.c.run_id == run.id)
     for name, thin in wanted.arrays.get(run.id, {}).items():
-        table = schema.array
-        query = select(table).where(table.c.run_id == run.id, table.c.name == name)
-        row = dict(there.execute(query).mappings().one())
+        copy_rows(there, here, array, array.c.run_id == run.id, array.c.name == name)
         if thin is not None:
-            row |= arrays.encode(thin(arrays.decode(row["dtype"], row["shape"], row["data"])))
-        here.execute(insert(table), row)
-
-
-def _metrics(
-    connection: Connection, run_id: str, table: Table, curves: Collection[str]
-) -> Iterator[list[dict[str, Any]]]:
-    """Rows of the table, some at a time: of `metric` those of the curves, and of the others the last one."""
-    query = select(table).where(table.c.run_id == run_id)
-    if table is schema.metric:
-        latest = schema.metric_latest
-        last = select(latest.c.name).where(latest.c.run_id == run_id, latest.c.name == table.c.name)
-        query = query.where(table.c.name.in_(list(curves)) | last.where(latest.c.step == table.c.step).exists())
-    for part in connection.execute(query).mappings().partitions(_ROWS):
-        yield [dict(row) for row in part]
+            thinned = arrays.encode(thin(queries.array(there, run.id, name)))
+            here.execute(update(array).where(array.c.run_id == run.id, array.c.name == name).values(**thinned))
 
 
 def _counts(there: Connection, here: Connection, runs: Sequence[RunRow]) -> dict[str, int]:

@@ -1,14 +1,16 @@
-"""An SQLite database as a file: found, never made; opened, never upgraded; written whole or not at all."""
+"""SQLite database files: finding, opening without upgrading, describing and writing them."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import URL, Engine
+from sqlalchemy import URL, Connection, Engine, Table, func, select
 from sqlalchemy.exc import DBAPIError
 
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
+from ssmail.store import schema
 from ssmail.store.connection import as_url, explained, make_engine, reading, revision_of
 from ssmail.store.schema import REVISIONS
 
@@ -16,33 +18,65 @@ SIDE_FILES = ("-wal", "-shm", "-journal")
 """Suffixes of the files that SQLite may keep beside a database."""
 
 
-def existing(where: str | Path) -> Path:
-    """The file of an SQLite database, given by its path or URL.
+@dataclass(frozen=True)
+class RunCount:
+    """How many runs have this environment, method, profile and state."""
 
-    Raises InputError for a server database, which is no file, and for a file that is not there.
+    environment: str
+    method: str
+    profile: str
+    state: str
+    runs: int
+
+
+@dataclass(frozen=True)
+class DatabaseInformation:
+    """What a database holds, with sizes in bytes. `size_bytes` includes the write-ahead log and `free_bytes`."""
+
+    path: Path
+    revision: str | None  # None: no tables yet
+    newest_revision: str
+    size_bytes: int
+    free_bytes: int
+    metrics: int  # rows
+    arrays: int  # rows
+    array_bytes: int  # as compressed
+    artifacts: int  # rows
+    runs: tuple[RunCount, ...]
+
+    @property
+    def array_share(self) -> float:
+        """The fraction of the size that arrays take, in [0, 1]."""
+        return self.array_bytes / self.size_bytes if self.size_bytes else 0.0
+
+
+def existing(where: str | Path) -> Path:
+    """Return the file of an SQLite database, given its path or URL.
+
+    Raises InputError for a server database and for a file that does not exist.
     """
     path = file_of(where)
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
     if not path.exists():
-        raise InputError(f"there is no database {path}; check the path, `ssmail train` makes a new one")
+        raise InputError(f"there is no database {path}; check the path, or create a database with `ssmail train`")
     return path
 
 
 def file_of(where: str | Path) -> Path:
-    """The absolute path that an SQLite database has, or would have. Raises InputError for a server database."""
+    """Return the absolute path of an SQLite database, which may not exist. Raises InputError for a server database."""
     url = as_url(where)
     if url.get_backend_name() != "sqlite":
         raise InputError(
-            f"{url.render_as_string(hide_password=True)} is a server database, and `ssmail db` is for SQLite files "
-            "only; use the server's own tools (its tables are upgraded by any other command that opens it)"
+            f"{url.render_as_string(hide_password=True)} is a server database, but `ssmail db` is for SQLite files "
+            "only; use the server's own tools (any other command upgrades its tables when it opens it)"
         )
     return Path(str(url.database))
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Engine]:
-    """An engine on the file as it is, whatever its schema; all connections are closed in the end."""
+    """Yield an engine for the file, whatever its schema is; close all its connections afterwards."""
     engine = make_engine(URL.create("sqlite", database=str(path)))
     try:
         yield engine
@@ -51,19 +85,19 @@ def opened(path: Path) -> Iterator[Engine]:
 
 
 def revision(path: Path) -> str | None:
-    """The revision of the schema in the file; None when it holds no table.
+    """Return the schema revision of the file; None when it has no tables.
 
-    Raises InputError for a file that is no database of ssmail's, is damaged, or is of a newer ssmail.
+    Raises InputError when the file is damaged, is not an ssmail database, or is from a newer ssmail.
     """
     with opened(path) as engine, reading(engine) as connection:
         return revision_of(connection, engine)
 
 
 def require_current(path: Path) -> None:
-    """Raise InputError, naming the remedy, unless the schema in the file is the one that this ssmail writes."""
+    """Raise InputError unless the file has the schema that this ssmail writes."""
     found = revision(path)
     if found != REVISIONS[-1]:
-        state = "has no tables yet" if found is None else f"has schema {found}, and this ssmail reads {REVISIONS[-1]}"
+        state = "has no tables yet" if found is None else f"has schema {found}, but this ssmail reads {REVISIONS[-1]}"
         raise InputError(f"{path} {state}; upgrade it first with `ssmail db upgrade --db {path}`")
 
 
@@ -92,3 +126,54 @@ def new_file(target: Path) -> Iterator[Path]:
 def _refuse_existing(target: Path) -> None:
     if target.exists() or target.is_symlink():
         raise InputError(f"{target} exists already and is not overwritten; give the name of a new file")
+
+
+def describe_contents(where: str | Path) -> DatabaseInformation:
+    """Describe one consistent state of the database, without upgrading or changing it.
+
+    Raises InputError when the file is missing or damaged, is not an ssmail database, or is from a newer ssmail.
+    """
+    path = existing(where)
+    found = revision(path)
+    with opened(path) as engine, reading(engine) as connection:
+        rows = (
+            {"metrics": 0, "arrays": 0, "array_bytes": 0, "artifacts": 0} if found is None else _row_counts(connection)
+        )
+        return DatabaseInformation(
+            path=path,
+            revision=found,
+            newest_revision=REVISIONS[-1],
+            size_bytes=_size(path),
+            free_bytes=_pragma(connection, "freelist_count") * _pragma(connection, "page_size"),
+            runs=() if found is None else _run_counts(connection),
+            **rows,
+        )
+
+
+def _row_counts(connection: Connection) -> dict[str, int]:
+    def count(table: Table) -> int:
+        return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
+
+    sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))
+    return {
+        "metrics": count(schema.metric),
+        "arrays": count(schema.array),
+        "array_bytes": int(connection.execute(sizes).scalar_one()),
+        "artifacts": count(schema.artifact),
+    }
+
+
+def _run_counts(connection: Connection) -> tuple[RunCount, ...]:
+    run = schema.run
+    columns = (run.c.environment, run.c.method, run.c.profile, run.c.state)
+    query = select(*columns, func.count()).group_by(*columns).order_by(*columns)
+    return tuple(RunCount(*row) for row in connection.execute(query))
+
+
+def _size(path: Path) -> int:
+    log = path.with_name(path.name + "-wal")
+    return path.stat().st_size + (log.stat().st_size if log.exists() else 0)
+
+
+def _pragma(connection: Connection, name: str) -> int:
+    return int(connection.exec_driver_sql(f"PRAGMA {name}").scalar_one())

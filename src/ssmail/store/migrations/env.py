@@ -1,4 +1,4 @@
-"""Alembic environment: upgrades the connection that ssmail.store.connection hands over, inside its transaction."""
+"""Alembic environment: runs the migrations on the connection of ssmail.store.connection, in its transaction."""
 
 from alembic import context
 

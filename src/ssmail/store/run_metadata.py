@@ -1,4 +1,4 @@
-"""Where and with what a run is computed: commit, versions, host, and the resources that this process has used."""
+"""Metadata of the run's environment: commit, versions, host, and the peak memory of this process."""
 
 import functools
 import resource
@@ -16,7 +16,7 @@ _ROOT = Path(ssmail.__file__).resolve().parents[2]
 
 @functools.cache
 def columns() -> dict[str, Any]:
-    """The columns of `run` that say where it is computed, gathered once in each process."""
+    """Return the columns of `run` that describe code and machine; they are collected once per process."""
     commit, dirty = git_state(_ROOT)
     return {
         "git_commit": commit,
@@ -28,7 +28,10 @@ def columns() -> dict[str, Any]:
 
 
 def git_state(root: Path) -> tuple[str | None, bool | None]:
-    """The commit of the ssmail checkout at `root`, and whether its code differs from it; None, None elsewhere."""
+    """Return the commit of the ssmail checkout at `root` and whether its code has uncommitted changes.
+
+    Returns (None, None) when `root` is not a checkout of ssmail or git fails.
+    """
     if not (root / ".git").exists() or not (root / "src" / "ssmail").is_dir():
         return None, None
     commit = _git(root, "rev-parse", "HEAD")
@@ -39,9 +42,9 @@ def git_state(root: Path) -> tuple[str | None, bool | None]:
 
 
 def peak_memory_bytes() -> int:
-    """The largest resident memory of this process so far, in bytes (host memory only, not that of a GPU)."""
+    """Return the peak resident memory of this process so far, in bytes (host memory, not GPU memory)."""
     status = Path("/proc/self/status")
-    if status.exists():  # Linux: ru_maxrss would include the parent that started this process
+    if status.exists():  # on Linux, ru_maxrss would include the parent that forked this process
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
@@ -60,6 +63,6 @@ def _git(root: Path, *arguments: str) -> str | None:
 
 def _torch_version() -> str:
     try:
-        return version("torch")  # read from the package's metadata: importing torch takes seconds
+        return version("torch")  # from the package metadata, because importing torch takes seconds
     except PackageNotFoundError:
         return "none"

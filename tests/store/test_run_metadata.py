@@ -3,7 +3,7 @@
 import subprocess
 from pathlib import Path
 
-from ssmail.store import origin
+from ssmail.store import run_metadata
 
 
 def test_the_commit_is_that_of_an_ssmail_checkout(tmp_path: Path) -> None:
@@ -12,26 +12,26 @@ def test_the_commit_is_that_of_an_ssmail_checkout(tmp_path: Path) -> None:
         command = ["git", "-C", str(tmp_path), *identity, *arguments]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
-    assert origin.git_state(tmp_path) == (None, None)
+    assert run_metadata.git_state(tmp_path) == (None, None)
     git("init")
     code = tmp_path / "src" / "ssmail" / "spec.py"
     code.parent.mkdir(parents=True)
     code.write_text("a = 1\n")
     (tmp_path / "experiments.yaml").write_text("")
     (tmp_path / "cli").mkdir()
-    assert origin.git_state(tmp_path) == (None, None)  # no commit yet
+    assert run_metadata.git_state(tmp_path) == (None, None)  # no commit yet
     git("add", ".")
     git("commit", "-m", "first")
     commit = git("rev-parse", "HEAD")
-    assert origin.git_state(tmp_path) == (commit, False)
+    assert run_metadata.git_state(tmp_path) == (commit, False)
     (tmp_path / "notes.txt").write_text("not code")
-    assert origin.git_state(tmp_path) == (commit, False)
+    assert run_metadata.git_state(tmp_path) == (commit, False)
     (tmp_path / "src" / "ssmail" / "new.py").write_text("")
-    assert origin.git_state(tmp_path) == (commit, True)
+    assert run_metadata.git_state(tmp_path) == (commit, True)
 
 
 def test_another_repository_around_an_installed_ssmail_is_not_its_checkout(tmp_path: Path) -> None:
     subprocess.run(["git", "init", str(tmp_path)], check=True, capture_output=True)
     (tmp_path / "lib" / "ssmail").mkdir(parents=True)
-    assert origin.git_state(tmp_path) == (None, None)
-    assert origin.git_state(tmp_path / "lib") == (None, None)
+    assert run_metadata.git_state(tmp_path) == (None, None)
+    assert run_metadata.git_state(tmp_path / "lib") == (None, None)

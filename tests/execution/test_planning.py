@@ -8,7 +8,7 @@ import pytest
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
-from ssmail.execution.durations import estimated_seconds, longest_first, total_seconds
+from ssmail.execution.planning import estimated_seconds, longest_first, total_seconds
 from ssmail.store import RunRow, Store
 
 

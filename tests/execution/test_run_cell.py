@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,28 +10,34 @@ import pytest
 from ssmail.config.experiments import build_spec
 from ssmail.data.expert_sets import save
 from ssmail.data.yjunction import generate
-from ssmail.execution import single
-from ssmail.execution.cells import Cell, Event, Job, Resume, Settings
-from ssmail.execution.single import run_cell
+from ssmail.execution import Resume
+from ssmail.execution import run_cell as module
+from ssmail.execution.cells import Cell, Event, Job, RunSettings
+from ssmail.execution.run_cell import MakeLoop, run_cell
 from ssmail.store import RunState, RunWriter, Store
-from tests.execution.fake_loop import Walk
+from ssmail.training.loop import TrainingLoop
+from tests.execution.fake_loop import Crashes, Diverges, OtherData, Walk
 from tests.execution.recorded import recorded
-
-WALK = Settings(loop_factory="tests.execution.fake_loop:Walk")
 
 
 class Death(BaseException):
     """Stands for SIGKILL: nothing catches it, so nothing is tidied up."""
 
 
-def run(cell: Cell, store: Store, settings: Settings = WALK, stop_after: int | None = None) -> list[Event]:
+def run(
+    cell: Cell,
+    store: Store,
+    settings: RunSettings = RunSettings(),  # noqa: B008 - immutable
+    stop_after: int | None = None,
+    loop: MakeLoop = Walk,
+) -> list[Event]:
     """All events of the cell; asks it to stop after that many epochs."""
     events: list[Event] = []
 
     def should_stop() -> bool:
         return stop_after is not None and bool(events) and events[-1].epoch >= stop_after
 
-    final = run_cell(cell, store, settings, events.append, should_stop)
+    final = run_cell(cell, store, settings, events.append, should_stop, loop)
     return [*events, final]
 
 
@@ -40,7 +45,7 @@ def run(cell: Cell, store: Store, settings: Settings = WALK, stop_after: int | N
 def undisturbed(tmp_path: Path, cells: list[Cell]) -> tuple[Any, ...]:
     """What an uninterrupted run of the first cell records."""
     store = Store.open(tmp_path / "undisturbed" / "ssmail.db")
-    event = run_cell(cells[0], store, WALK, lambda _: None, lambda: False)
+    event = run_cell(cells[0], store, RunSettings(), lambda _: None, lambda: False, Walk)
     assert event.run_id is not None
     result = recorded(store, event.run_id)
     store.close()
@@ -80,7 +85,7 @@ MOMENTS: dict[str, tuple[Any, str, int]] = {
     # where the process dies: before the n-th call of this method
     "before the first epoch": (Walk, "run_epoch", 1),
     "before an epoch's metrics": (RunWriter, "epoch", 3),
-    "after the metrics, before the best checkpoint": (single, "save_checkpoint", 1),
+    "after the metrics, before the best checkpoint": (module, "save_checkpoint", 1),
     "after the metrics, before the last checkpoint": (Walk, "state_dict", 3),
     "between epochs": (Walk, "run_epoch", 4),
     "before the final evaluation": (Walk, "final_evaluation", 1),
@@ -122,7 +127,8 @@ def test_a_death_at_any_moment_changes_no_number(
     refused = run(cells[0], store)[-1]
     assert (refused.kind, refused.bad_input) == ("failed", True)
     assert "is being computed by another process" in refused.message
-    events = run(cells[0], store, replace(WALK, stale_seconds=0))
+    store.stale_seconds = 0
+    events = run(cells[0], store)
     assert (events[0].kind, events[-1].kind) == ("resumed", "finished")
     (row,) = store.runs()
     assert (row.state, row.resumes) == (RunState.FINISHED, 1)
@@ -156,14 +162,13 @@ def test_stopping_interrupts_and_resuming_continues(
 
 
 def test_asked_to_stop_at_once_it_leaves_no_run(store: Store, cells: list[Cell]) -> None:
-    event = run_cell(cells[0], store, WALK, lambda _: None, lambda: True)
+    event = run_cell(cells[0], store, RunSettings(), lambda _: None, lambda: True, Walk)
     assert (event.kind, event.run_id) == ("interrupted", None)
     assert store.runs() == []
 
 
 def test_a_crash_is_kept_with_its_traceback_and_can_be_resumed(store: Store, cells: list[Cell]) -> None:
-    crashing = replace(WALK, loop_factory="tests.execution.fake_loop:Crashes")
-    event = run(cells[1], store, crashing)[-1]
+    event = run(cells[1], store, loop=Crashes)[-1]
     assert (event.kind, event.epoch, event.message) == ("failed", 1, "ZeroDivisionError: planted")
     assert not event.bad_input
     (row,) = store.runs()
@@ -177,8 +182,7 @@ def test_a_crash_is_kept_with_its_traceback_and_can_be_resumed(store: Store, cel
 
 
 def test_divergence_ends_a_run_without_final_evaluation(store: Store, cells: list[Cell]) -> None:
-    diverging = replace(WALK, loop_factory="tests.execution.fake_loop:Diverges")
-    event = run(cells[0], store, diverging)[-1]
+    event = run(cells[0], store, loop=Diverges)[-1]
     assert (event.kind, event.epoch, event.message) == ("diverged", 2, "weights became NaN or infinite in epoch 3")
     (row,) = store.runs()
     assert (row.state, row.error) == (RunState.DIVERGED, event.message)
@@ -186,7 +190,7 @@ def test_divergence_ends_a_run_without_final_evaluation(store: Store, cells: lis
     assert {step for _, step in metrics} == {1, 2}
     assert arrays == {}
     assert "last.pt" in artifacts
-    (again,) = run(cells[0], store, diverging)
+    (again,) = run(cells[0], store, loop=Diverges)
     assert (again.kind, again.message) == ("skipped", f"diverged already, as run {row.name}")
 
 
@@ -194,26 +198,26 @@ def test_a_finished_cell_is_skipped_unless_begun_afresh(store: Store, cells: lis
     run(cells[0], store)
     (first,) = store.runs()
     for resume in (Resume.AUTO, Resume.REQUIRE):
-        (event,) = run(cells[0], store, replace(WALK, resume=resume))
+        (event,) = run(cells[0], store, RunSettings(resume=resume))
         assert (event.kind, event.run_id, event.message) == (
             "skipped",
             first.id,
             f"finished already, as run {first.name}",
         )
-    assert run(cells[0], store, replace(WALK, resume=Resume.NEVER))[0].kind == "started"
+    assert run(cells[0], store, RunSettings(resume=Resume.NEVER))[0].kind == "started"
     assert [row.state for row in store.runs()] == [RunState.FINISHED] * 2
     assert store.runs()[0] == first
 
 
 def test_never_begins_afresh_and_keeps_the_old_run(store: Store, cells: list[Cell]) -> None:
     run(cells[0], store, stop_after=2)
-    events = run(cells[0], store, replace(WALK, resume=Resume.NEVER))
+    events = run(cells[0], store, RunSettings(resume=Resume.NEVER))
     assert kinds(events)[0] == ("started", 0)
     assert [row.state for row in store.runs()] == [RunState.INTERRUPTED, RunState.FINISHED]
 
 
 def test_require_refuses_to_begin(store: Store, cells: list[Cell]) -> None:
-    require = replace(WALK, resume=Resume.REQUIRE)
+    require = RunSettings(resume=Resume.REQUIRE)
     (event,) = run(cells[0], store, require)
     assert (event.kind, event.bad_input) == ("failed", True)
     assert event.message == f"seed 0 of this spec has no run to resume in {store.where}; use --resume auto"
@@ -225,16 +229,16 @@ def test_require_refuses_to_begin(store: Store, cells: list[Cell]) -> None:
 def test_require_refuses_a_run_without_checkpoint(store: Store, cells: list[Cell]) -> None:
     run(cells[0], store, stop_after=0)
     assert store.runs()[0].state is RunState.INTERRUPTED
-    (event,) = run(cells[0], store, replace(WALK, resume=Resume.REQUIRE))
+    (event,) = run(cells[0], store, RunSettings(resume=Resume.REQUIRE))
     assert (event.kind, event.bad_input) == ("failed", True)
     assert kinds(run(cells[0], store))[0] == ("resumed", 0)
 
 
 def test_other_data_is_not_mixed_into_a_run(store: Store, cells: list[Cell]) -> None:
     run(cells[0], store, stop_after=1)
-    (event,) = run(cells[0], store, replace(WALK, loop_factory="tests.execution.fake_loop:OtherData"))
+    (event,) = run(cells[0], store, loop=OtherData)
     assert event.bad_input
-    assert "has changed since it was interrupted; start afresh with --resume never" in event.message
+    assert "has changed since it was interrupted; start a new run with --resume never" in event.message
     assert store.runs()[0].state is RunState.INTERRUPTED
 
 
@@ -253,7 +257,7 @@ def test_a_run_taken_over_stops_without_harm(store: Store, cells: list[Cell], mo
 
     def overtaken(loop: Walk) -> dict[str, float]:
         if loop.epoch == 2 and not taken:  # as if this process had slept while another resumed its run
-            taken.append(store.resume_run(store.runs()[0].id, 2, stale_seconds=0))
+            taken.append(Store.open(store.url, stale_seconds=0).resume_run(store.runs()[0].id, 2))
         return step(loop)
 
     monkeypatch.setattr(Walk, "run_epoch", overtaken)
@@ -275,19 +279,19 @@ def test_the_heart_beats_within_a_long_epoch(store: Store, cells: list[Cell], mo
         return step(loop)
 
     monkeypatch.setattr(Walk, "run_epoch", watched)
-    assert run(cells[0], store, replace(WALK, heartbeat_seconds=0.05))[-1].kind == "finished"
+    assert run(cells[0], store, RunSettings(heartbeat_seconds=0.05))[-1].kind == "finished"
     assert len(seen) == 4
 
 
 def test_cuda_without_a_device_is_bad_input(store: Store, cells: list[Cell], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    (event,) = run(cells[0], store, replace(WALK, device="cuda"))
+    (event,) = run(cells[0], store, RunSettings(device="cuda"))
     assert (event.kind, event.bad_input) == ("failed", True)
-    assert event.message == "this machine offers PyTorch no CUDA device; use --device cpu"
+    assert event.message == "PyTorch finds no CUDA device on this machine; use --device cpu"
 
 
 def test_jobs_and_events_survive_the_way_between_processes(cells: list[Cell]) -> None:
-    job = Job(cells[2], "sqlite:////tmp/a.db", Settings(resume=Resume.REQUIRE, stale_seconds=1.5))
+    job = Job(cells[2], "sqlite:////tmp/a.db", RunSettings(resume=Resume.REQUIRE, heartbeat_seconds=1.5))
     assert Job.from_line(job.as_line()) == job
     assert Job.from_line(job.as_line()).cell.spec.hash() == cells[2].spec.hash()
     event = Event("epoch", cells[2], "abc", 1, 4, {"a": float("inf"), "b": 0.1}, "line\nbreak", True)
@@ -299,10 +303,10 @@ def test_a_finished_cell_is_skipped_only_while_its_data_file_is_the_same(store: 
     path = tmp_path / "experts.npz"
     spec = build_spec("ssail", "yjunction", "smoke", [f"data.path={path}", "training.epochs=1"])
     save(generate(spec.data.yjunction), path)
-    assert run(Cell(spec, 0), store, Settings())[-1].kind == "finished"
-    assert run(Cell(spec, 0), store, Settings())[-1].kind == "skipped"
+    assert run(Cell(spec, 0), store, loop=TrainingLoop)[-1].kind == "finished"
+    assert run(Cell(spec, 0), store, loop=TrainingLoop)[-1].kind == "skipped"
     save(generate(spec.data.yjunction.model_copy(update={"seed": 5})), path, force=True)
-    (refused,) = run(Cell(spec, 0), store, Settings())
+    (refused,) = run(Cell(spec, 0), store, loop=TrainingLoop)
     assert (refused.kind, refused.bad_input) == ("failed", True)
     assert "has changed since run" in refused.message
-    assert run(Cell(spec, 0), store, Settings(resume=Resume.NEVER))[-1].kind == "finished"
+    assert run(Cell(spec, 0), store, RunSettings(resume=Resume.NEVER), loop=TrainingLoop)[-1].kind == "finished"
