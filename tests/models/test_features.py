@@ -123,8 +123,8 @@ def test_actions_are_read_in_the_units_of_velocities_and_come_back() -> None:
     experts = torch.rand(5, 9, 3, 4, generator=torch.Generator().manual_seed(0))
     features = Features.of(required(build_spec("ssail", "mocap", "smoke").model), experts)
     velocity = experts[..., 2:]
-    torch.testing.assert_close(features.of_actions(velocity), features(experts, experts[:, 0])[..., 2:4])
-    torch.testing.assert_close(features.to_actions(features.of_actions(velocity)), velocity)
+    torch.testing.assert_close(features.normalize_actions(velocity), features(experts, experts[:, 0])[..., 2:4])
+    torch.testing.assert_close(features.denormalize_actions(features.normalize_actions(velocity)), velocity)
     plain = replace(features, normalization=None)
-    assert plain.of_actions(velocity) is velocity
-    assert plain.to_actions(velocity) is velocity
+    assert plain.normalize_actions(velocity) is velocity
+    assert plain.denormalize_actions(velocity) is velocity

@@ -12,6 +12,7 @@ from ssmail.models import decoders, fast_messages, message_passing, variational_
 from ssmail.models.critic import TwinCritic
 from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
 from ssmail.models.discriminator import Discriminator
+from ssmail.models.graph_encoder import GraphEncoder
 from ssmail.models.policy import Actor
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from tests.models.test_message_passing import SPEC
@@ -96,6 +97,18 @@ class ActorDistribution(nn.Module):
         return self.actor.distribution(x, graph)
 
 
+class GraphLogits(nn.Module):
+    """The logits of a graph encoder, without its memory."""
+
+    def __init__(self, encoder: GraphEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, x: Tensor) -> Tensor:
+        logits: Tensor = self.encoder(x)[0]
+        return logits
+
+
 @pytest.mark.parametrize("n", [1, 2, 4, 10])
 @pytest.mark.parametrize("first_type_is_none", [True, False])
 def test_networks_of_the_graph_policy(n: int, first_type_is_none: bool) -> None:
@@ -105,6 +118,7 @@ def test_networks_of_the_graph_policy(n: int, first_type_is_none: bool) -> None:
     assert_same(ActorDistribution(Actor(5, 2, model)), x, graph)
     assert_same(TwinCritic(7, model), x, action, graph)
     assert_same(Discriminator(7, 8), x, action)
+    assert_same(GraphLogits(GraphEncoder(5, 6, 3)), x)
 
 
 def test_single_precision() -> None:

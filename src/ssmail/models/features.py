@@ -44,26 +44,26 @@ class Features:
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
         """Map states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) to (B, T, N, F)."""
         b, t, n, _ = states.shape
-        parts = [self.read(states)]
+        parts = [self.normalize_states(states)]
         if self.time:
             steps = torch.arange(first_step, first_step + t, dtype=states.dtype, device=states.device)
             scaled = 2 * steps / (self.steps - 1) - 1
             parts.append(scaled.view(1, t, 1, 1).expand(b, t, n, 1))
         if self.start:
-            parts.append(self.read(start).unsqueeze(1).expand(b, t, n, -1))
+            parts.append(self.normalize_states(start).unsqueeze(1).expand(b, t, n, -1))
         if self.agents:
             parts.append(torch.eye(n, dtype=states.dtype, device=states.device).expand(b, t, n, n))
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
-    def of_actions(self, actions: Tensor) -> Tensor:
+    def normalize_actions(self, actions: Tensor) -> Tensor:
         """Convert actions (..., N, A), which are velocities, from scaled units to the networks' units."""
         return actions if self.normalization is None else self.normalization.velocity.normalize(actions)
 
-    def to_actions(self, read: Tensor) -> Tensor:
+    def denormalize_actions(self, read: Tensor) -> Tensor:
         """Convert a network's actions (..., N, A) to scaled units."""
         return read if self.normalization is None else self.normalization.velocity.denormalize(read)
 
-    def read(self, states: Tensor) -> Tensor:
+    def normalize_states(self, states: Tensor) -> Tensor:
         """Convert states (..., N, 2P) from scaled units to the networks' units."""
         relative = self._relative(states)
         return relative if self.normalization is None else self.normalization.normalize(relative)

@@ -61,13 +61,19 @@ class PairLayer(nn.Module):
 
     def gathered(self, x: Tensor) -> Tensor:
         """Apply the layer to every edge in readable form: x (..., N, D) -> (..., N, N - 1, H)."""
-        weight = torch.cat([self.sender.weight, self.receiver.weight], dim=1)
-        return nn.functional.linear(both_ends(x), weight, self.receiver.bias)
+        return self._apply_to(both_ends(x))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply the layer per agent and broadcast: x (..., N, D) -> (..., N, N, H), the diagonal included."""
+        """Apply the layer to all pairs, the diagonal included: x (..., N, D) -> (..., N, N, H)."""
+        if not FAST:
+            x_i = x.unsqueeze(-2).expand(*x.shape[:-1], x.shape[-2], -1)  # (..., N, N, D)
+            return self._apply_to(torch.cat([x_i, x.unsqueeze(-3).expand_as(x_i)], dim=-1))
         pairs: Tensor = self.sender(x).unsqueeze(-2) + self.receiver(x).unsqueeze(-3)
         return pairs
+
+    def _apply_to(self, ends: Tensor) -> Tensor:
+        weight = torch.cat([self.sender.weight, self.receiver.weight], dim=1)
+        return nn.functional.linear(ends, weight, self.receiver.bias)
 
 
 class EdgeFunction(nn.Module):

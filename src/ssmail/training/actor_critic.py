@@ -81,7 +81,7 @@ class ActorCritic:
             next_action, next_log_prob = self.policy.actor.sample_with_log_prob(
                 at.next_x, at.next_graph, at.next_velocity, self._noise(at.actions)
             )
-            next_action = self.features.of_actions(next_action)
+            next_action = self.features.normalize_actions(next_action)
             next_q = self.target_critic(at.next_x, next_action, at.next_graph)
             target = critic_target(rewards, next_q, next_log_prob, self.temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
@@ -112,7 +112,7 @@ class ActorCritic:
         at = chosen(x.shape[1])
         return Transitions(
             x=x[:, at],
-            actions=self.features.of_actions(batch.actions[:, at]),
+            actions=self.features.normalize_actions(batch.actions[:, at]),
             graph=graphs[:, at],
             velocity=states[:, at, :, a:],
             next_x=next_x[:, at],
@@ -146,7 +146,7 @@ class ActorCritic:
     def _update_actor(self, at: Transitions, learns: bool) -> tuple[Tensor, Tensor]:
         """Take one step of actor and graph encoder, then one of the temperature; return the loss and log pi."""
         action, log_prob = self.policy.actor.sample_with_log_prob(at.x, at.graph, at.velocity, self._noise(at.actions))
-        action = self.features.of_actions(action)
+        action = self.features.normalize_actions(action)
         self.critic.requires_grad_(False)  # the actor's gradient flows through the critics but not into them
         loss = actor_loss(self.critic(at.x, action, at.graph.detach()), log_prob, self.temperature)
         self.critic.requires_grad_(True)

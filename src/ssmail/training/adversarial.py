@@ -147,7 +147,7 @@ class AdversarialLearner:
         chosen = self._pick_steps(everything.actions.shape[1])
         states, actions = everything.states[:, :-1], everything.actions[:, chosen]
         x = self._add_input_noise(self.features(states, states[:, 0])[:, chosen], states.shape[-1])
-        actions = self._add_input_noise(self.features.of_actions(actions))
+        actions = self._add_input_noise(self.features.normalize_actions(actions))
         loss, terms = self.objective.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
         # wail bounds D's slope by a gradient penalty, or by clipping its weights.
         if self.wasserstein and self.wasserstein.constraint == "penalty":

@@ -56,7 +56,7 @@ class RewardInputs:
     def from_trajectories(cls, features: Features, states: Tensor, actions: Tensor) -> "RewardInputs":
         """Take all steps of trajectories: states (B, T + 1, N, D) without the last, and actions (B, T, N, A)."""
         other_features = features(states[:, :-1], states[:, 0])[..., states.shape[-1] :]
-        return cls(states[:, :-1], other_features, features.of_actions(actions))
+        return cls(states[:, :-1], other_features, features.normalize_actions(actions))
 
 
 def position_gradient(learner: AdversarialLearner, at: RewardInputs, agent: int) -> tuple[Tensor, Tensor]:
@@ -67,7 +67,7 @@ def position_gradient(learner: AdversarialLearner, at: RewardInputs, agent: int)
     position = at.states[..., agent, :2].detach().clone().requires_grad_()
     moved = at.states.detach().clone()
     moved[..., agent, :2] = position
-    x = torch.cat([learner.features.read(moved), at.other_features], dim=-1)
+    x = torch.cat([learner.features.normalize_states(moved), at.other_features], dim=-1)
     values = learner.reward(x, at.actions)[..., agent]
     (gradient,) = torch.autograd.grad(values.sum(), position)
     return values.detach(), gradient

@@ -68,7 +68,7 @@ class VariationalModel(nn.Module):
         graphs: (B, T or 1, N, N, K). The decoder predicts a residual on the velocity as it reads it.
         """
         output, memory = self.decoder(self.read(states), graphs, memory)
-        return self.features.to_actions(output), memory
+        return self.features.denormalize_actions(output), memory
 
     def sample(self, logits: Tensor, noise: Tensor) -> Tensor:
         """Sample one-hot graphs by the straight-through Gumbel softmax."""
