@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.claims import Part, Sample

@@ -9,7 +9,7 @@ import typer
 from ssmail.errors import InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.needs import Needs

@@ -8,7 +8,7 @@ import typer
 
 from ssmail.plots.formatting import short_code
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, short, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, short, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.explanation import Agreement, Explanation

@@ -1,4 +1,4 @@
-"""The Typer application: which commands there are, and how any failure ends (one line on stderr and an exit code)."""
+"""The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
 import difflib
 import os
@@ -8,11 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from ssmail import __version__
-from ssmail.errors import SsmailError
-from ssmail_cli import ablate, claims, data, db, explain, mocap, plot, report, reproduce, runs, train
-from ssmail_cli.display import complaint
-
-INTERRUPTED = 130
+from ssmail.errors import ExitCode, SsmailError
+from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
+from ssmail_cli.output import error_line
 
 app = typer.Typer(
     name="ssmail",
@@ -22,13 +20,13 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-app.command("generate-yjunction")(data.generate_yjunction)
-app.command("generate-letters")(data.generate_letters)
-app.command("prep-mocap")(mocap.prep_mocap)
+app.command("generate-yjunction")(datasets.generate_yjunction)
+app.command("generate-letters")(datasets.generate_letters)
+app.command("prep-mocap")(datasets.prep_mocap)
 app.command("train")(train.train)
-app.command("ablate")(ablate.ablate)
-app.command("ablate-alpha")(ablate.alias("alpha"))
-app.command("ablate-beta")(ablate.alias("beta"))
+app.command("ablate")(train.ablate)
+app.command("ablate-alpha", help="Short for `ssmail ablate alpha`.")(train.ablate_alias)
+app.command("ablate-beta", help="Short for `ssmail ablate beta`.")(train.ablate_alias)
 app.command("reproduce")(reproduce.reproduce)
 app.command("report")(report.report)
 app.command("claims")(claims.claims)
@@ -66,15 +64,15 @@ def run(arguments: list[str]) -> int:
     except SsmailError as error:
         return _complain(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
-        return INTERRUPTED
+        return ExitCode.INTERRUPTED
     except BrokenPipeError:  # the reader of stdout, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return ExitCode.FAILURE
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
-            return _complain(_usage(error), 2)
-        return _complain(complaint(error), 1)
-    return code if isinstance(code, int) else 0
+            return _complain(_usage(error), ExitCode.BAD_INPUT)
+        return _complain(error_line(error), ExitCode.FAILURE)
+    return code if isinstance(code, int) else ExitCode.OK
 
 
 def _complain(sentence: str, code: int) -> int:

@@ -1,39 +1,107 @@
-"""Options that several commands share, and the store they name."""
+"""Options that several commands share, and the functions that read their values."""
 
 from contextlib import suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ssmail.errors import InputError, SsmailError, unknown_name
-from ssmail_cli.display import Format
+from ssmail.execution import Resume
+from ssmail.paper.results import FIGURES
+from ssmail_cli.output import Format
 
 if TYPE_CHECKING:
+    from ssmail.evaluation.statistics import Statistic
     from ssmail.store import RunRow, Store
 
 DEFAULT_DATABASE = "results/ssmail.db"
+DEFAULT_OUT = Path("results/figures")
+DEFAULT_FORMATS = ["png"]
+MOST_SEEDS = 1000
+
+
+class Device(StrEnum):
+    """Where to compute."""
+
+    AUTO = "auto"
+    CPU = "cpu"
+    CUDA = "cuda"
+
+
+def _known_formats(formats: list[str]) -> list[str]:
+    """Return the formats as given. Raises InputError for one that figures are not written in."""
+    from ssmail.plots.provenance import FORMATS
+
+    for name in formats:
+        if name not in FORMATS:
+            raise unknown_name("figure format", name, FORMATS)
+    return formats
+
 
 Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON; NaN and infinities are text in it.")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, with NaN and infinities as text.")]
 Output = Annotated[
     Format | None,
     typer.Option("--format", help="How to print.", show_default="a table on a terminal, else CSV"),
 ]
+
+# Which runs
+RunIds = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[RUN]...", help="Ids or their first digits; all runs when none is given."),
+]
 Method = Annotated[str | None, typer.Option("--method", help="Only runs of this method.")]
 Environment = Annotated[str | None, typer.Option("--env", help="Only runs on this environment.")]
 Profile = Annotated[str | None, typer.Option("--profile", help="Only runs of this profile.")]
+FigureProfile = Annotated[
+    str | None,
+    typer.Option("--profile", help="Only runs of this profile.", show_default="the one that each figure draws"),
+]
 State = Annotated[
     str | None,
-    typer.Option("--state", help="Only runs in this state: queued, running, finished, failed, diverged, interrupted."),
+    typer.Option("--state", help="Only runs in this state: running, finished, failed, diverged or interrupted."),
 ]
-Figure = Annotated[str | None, typer.Option("--figure", help="Only runs that this figure of the paper needs, as fig5.")]
-RunIds = Annotated[
+Figure = Annotated[str | None, typer.Option("--figure", help="Only runs that this figure of the paper needs: fig5.")]
+
+# Training
+SEEDS_HELP = "Seeds, one run each: 0-4, or 0,2,5, or 0-2,7."
+TrainingProfile = Annotated[
+    str, typer.Option("--profile", help="smoke (seconds), quick (minutes) or paper (the paper's scale).")
+]
+Seeds = Annotated[str, typer.Option("--seeds", help=SEEDS_HELP)]
+Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs to compute at once, one process each.")]
+Settings = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[RUN]...", help="Ids, or their first digits; all runs when none is given."),
+    typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the spec: sac.gamma=0.9; repeatable."),
+]
+ResumeOption = Annotated[
+    Resume,
+    typer.Option("--resume", help="Continue an unfinished run: if there is one, never, or fail without one."),
+]
+DeviceOption = Annotated[Device, typer.Option("--device", help="auto takes a GPU when there is one.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would run, and train nothing.")]
+
+# Drawing
+STATISTICS = "mean-std, median-iqr or mean-ci"
+OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
+Formats = Annotated[
+    list[str],
+    typer.Option("--format", callback=_known_formats, help="png, pdf or svg; repeatable.", show_default="png"),
+]
+Stat = Annotated[str | None, typer.Option("--stat", help=f"Centre and band: {STATISTICS}.", show_default="mean-std")]
+_WITH_STATISTIC = list(dict.fromkeys(figure.name for figure in FIGURES.values() if figure.has_statistic))
+StatOfFigures = Annotated[
+    str | None,
+    typer.Option(
+        "--stat",
+        help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
+        show_default="mean-std",
+    ),
 ]
 
 
@@ -68,8 +136,7 @@ def select_runs(
     state: str | None,
     figure: str | None,
 ) -> "list[RunRow]":
-    """The runs that meet every condition given, newest last. Raises InputError for an unknown id, state or figure."""
-    from ssmail.paper.results import FIGURES
+    """Return the runs that meet every condition, newest last. Raises InputError for an unknown id, state or figure."""
     from ssmail.plots.series import needed_by
     from ssmail.store import RunState
 
@@ -80,3 +147,41 @@ def select_runs(
         return runs
     needed = needed_by(FIGURES[figure].name if figure in FIGURES else figure)  # experiments.yaml knows no aliases
     return [run for run in runs if needed(run)]
+
+
+def parse_seeds(text: str) -> list[int]:
+    """ "0-2,7" -> [0, 1, 2, 7], in the order given and each once. Raises InputError for anything else."""
+    seeds: dict[int, None] = {}
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise InputError(f"--seeds takes whole numbers and ranges such as 0-4 or 0,2,5, not '{text}'.")
+        low, high = int(first), int(last or first)
+        if low > high:
+            raise InputError(f"the range {part.strip()} in --seeds runs backwards; write {high}-{low}.")
+        if high - low >= MOST_SEEDS or high >= 2**31:
+            raise InputError(f"--seeds {text} is more than {MOST_SEEDS} seeds or a seed above 2147483647; give less.")
+        seeds.update(dict.fromkeys(range(low, high + 1)))
+    return list(seeds)
+
+
+def pick_device(choice: Device) -> str:
+    """ "cpu" or "cuda". Raises InputError for cuda without one."""
+    if choice is Device.CPU:
+        return "cpu"
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if choice is Device.CUDA:
+        raise InputError("--device cuda needs a CUDA GPU and none is found; use --device cpu.")
+    return "cpu"
+
+
+def parse_statistic(stat: str | None) -> "Statistic | None":
+    """Return the statistic of that name. Raises InputError for an unknown one."""
+    from ssmail.evaluation.statistics import Statistic
+
+    if stat is not None and stat not in list(Statistic):
+        raise unknown_name("statistic", stat, list(Statistic))
+    return None if stat is None else Statistic(stat)

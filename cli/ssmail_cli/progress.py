@@ -1,29 +1,29 @@
-"""How a sweep shows itself on stderr: live lines on a terminal, a few log lines elsewhere."""
+"""Progress of a sweep on stderr: live lines on a terminal, a few log lines elsewhere."""
 
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ssmail_cli.display import note, short
-from ssmail_cli.results import SHOWN, shown_on
+from ssmail_cli.output import note, short
+from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from ssmail.execution.cells import Cell, Event
 
-Sweep = Mapping["Cell", Mapping[str, Any]]  # what each cell is called; see ssmail_cli.sweep
+Sweep = Mapping["Cell", Mapping[str, Any]]  # what tells each cell from the others; see sweep.py
 Report = Callable[["Event"], None]
 
-LABELS = dict.fromkeys((shown.validation for shown in SHOWN.values()), "val") | {
+LABELS = dict.fromkeys((metrics.validation for metrics in ENVIRONMENT_METRICS.values()), "val") | {
     "discriminator/loss": "disc",
     "critic/loss": "critic",
     "actor/loss": "actor",
     "cloning/loss": "loss",
 }
-LOG_LINES = 10  # of the epochs of one run
-FEW = 10  # so many cells have a line each from the beginning, and a log of their epochs
+LOG_LINES = 10  # epochs that are logged of one run
+FEW = 10  # up to this many runs, each has a line from the beginning and a log of its epochs
 
 
 def label(names: Mapping[str, Any]) -> str:
@@ -33,17 +33,17 @@ def label(names: Mapping[str, Any]) -> str:
 
 @contextmanager
 def reporter(sweep: Sweep) -> Iterator[Report]:
-    """A function that shows each Event of the training of these cells."""
+    """Yield a function that shows each event of the training of these cells."""
     labels = {cell: label(names) for cell, names in sweep.items()}
     if not sys.stderr.isatty():
         yield _Log(labels)
         return
     with _progress() as progress:
-        yield _LineForEach(progress, labels) if len(labels) <= FEW else _RunningOnes(progress, labels)
+        yield _LinePerRun(progress, labels) if len(labels) <= FEW else _RunningRuns(progress, labels)
 
 
 class _Log:
-    """Plain lines: when a run starts and ends, and about LOG_LINES of its epochs where there are FEW runs."""
+    """Plain lines: the start and end of each run, and about LOG_LINES of its epochs if there are at most FEW runs."""
 
     def __init__(self, labels: "Mapping[Cell, str]") -> None:
         self._labels, self._ended = labels, 0
@@ -72,8 +72,8 @@ def _progress() -> "Progress":
     return Progress(*columns, console=Console(stderr=True), speed_estimate_period=120)
 
 
-class _LineForEach:
-    """A line for each run, waiting, running or ended."""
+class _LinePerRun:
+    """A live line for each run: waiting, running or ended."""
 
     def __init__(self, progress: "Progress", labels: "Mapping[Cell, str]") -> None:
         self._progress = progress
@@ -86,10 +86,11 @@ class _LineForEach:
         _update(self._progress, self._tasks[event.cell], event)
 
 
-class _RunningOnes:
-    """A line for all runs together, whose bar counts their epochs, and below it one for each that is running.
+class _RunningRuns:
+    """A live line for all runs together, whose bar counts their epochs, and one for each run in progress.
 
-    What need not be computed is taken off the total, so that the time remaining is judged by the work done here.
+    Epochs that need not be computed are subtracted from the total, so that the remaining time is estimated from the
+    work done here.
     """
 
     def __init__(self, progress: "Progress", labels: "Mapping[Cell, str]") -> None:
@@ -108,18 +109,18 @@ class _RunningOnes:
             task = self._progress.add_task(self._labels[event.cell], total=event.epochs, status="")
             self._tasks[event.cell] = task
             _update(self._progress, task, event)
-            self._forget(event.epoch)
+            self._subtract(event.epoch)
 
     def _end(self, event: "Event") -> None:
-        """Turn the line of the run into a line of text above."""
+        """Replace the live line of the run by a line of text above."""
         self._ended += 1
         self._progress.console.print(f"{self._labels[event.cell]}: {_headline(event)}", markup=False, highlight=False)
         if event.cell in self._tasks:
             self._progress.remove_task(self._tasks.pop(event.cell))
-        self._forget(event.epochs - (0 if event.kind == "skipped" else event.epoch))
+        self._subtract(event.epochs - (0 if event.kind == "skipped" else event.epoch))
 
-    def _forget(self, epochs: int) -> None:
-        """Take epochs that are not to be computed off the total."""
+    def _subtract(self, epochs: int) -> None:
+        """Subtract epochs that will not be computed from the total."""
         self._left -= epochs
         self._progress.update(self._all, total=self._left, status=self._status())
 
@@ -138,9 +139,9 @@ def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
 
 
 def _headline(event: "Event") -> str:
-    """What happened to the run, in a few words."""
+    """Return what happened to the run, in a few words."""
     run = f" (run {event.run_id[:8]})" if event.run_id else ""
-    error = event.metrics.get(shown_on(event.cell.spec.environment).error)
+    error = event.metrics.get(environment_metrics(event.cell.spec.environment).error)
     words = {
         "started": f"started{run}",
         "resumed": f"resumed after epoch {event.epoch}{run}",
@@ -151,7 +152,7 @@ def _headline(event: "Event") -> str:
 
 
 def _losses(event: "Event") -> str:
-    """The losses of an epoch, and of the validation metrics the one that is shown of the environment."""
-    metrics, validation = event.metrics, shown_on(event.cell.spec.environment).validation
+    """Return the losses of an epoch and the validation error of its environment."""
+    metrics, validation = event.metrics, environment_metrics(event.cell.spec.environment).validation
     shown = [name for name in LABELS if name in metrics and (name == validation or not name.startswith("validation/"))]
     return "  ".join(f"{LABELS[name]} {metrics[name]:.3g}" for name in shown)

@@ -1,42 +1,42 @@
-"""`ssmail report`: figures and verdicts of the stored runs as a report; and what `ssmail reproduce` ends with."""
+"""Drawing the paper's figures one after another, and `ssmail report`: figures and verdicts on one page."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from ssmail_cli.drawing import INCOMPLETE, draw_all
-from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
-from ssmail_cli.options import DEFAULT_DATABASE, Database, open_store
+from ssmail.errors import ExitCode
+from ssmail.paper.results import FIGURES
+from ssmail_cli import options
+from ssmail_cli.output import error_line, note
 
 if TYPE_CHECKING:
+    from ssmail.evaluation.statistics import Statistic
     from ssmail.paper.report.drawing import Drawn
     from ssmail.store import Store
 
 
 def report(
-    profile: Annotated[
-        str | None,
-        typer.Option("--profile", help="Runs of this profile.", show_default="the one that each figure draws"),
-    ] = None,
-    out: OutDir = DEFAULT_OUT,
-    formats: Formats = DEFAULT_FORMATS,
-    stat: Stat = None,
-    db: Database = DEFAULT_DATABASE,
+    profile: options.FigureProfile = None,
+    out: options.OutDir = options.DEFAULT_OUT,
+    formats: options.Formats = options.DEFAULT_FORMATS,
+    stat: options.StatOfFigures = None,
+    db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Write the report of the stored runs: verdicts, figures, and the runs behind them. Nothing is trained.
+    """Write a report of the stored runs: verdicts, figures, and the runs behind them.
 
-    Draws every figure whose runs are stored into --out, and beside that folder writes report.md and report.html, one
-    page without any other file. Prints the paths. Exit code 3: a figure could not be drawn; the report says why.
+    Trains nothing. Draws every figure whose runs are stored into --out, and writes report.md and report.html (a single
+    self-contained page) beside that folder. Prints the paths. Exit code 3: a figure could not be drawn; the report
+    says why.
     """
-    statistic = parse_statistic(stat)
-    store = open_store(db)
+    statistic = options.parse_statistic(stat)
+    store = options.open_store(db)
     figures = draw_all(store, out, formats, profile, statistic)
     command = f"ssmail report --db {db}" + (f" --profile {profile}" if profile else "")
     write_report(store, figures, out, command, profile)
     if any(drawn.lacks for drawn in figures):
-        raise typer.Exit(INCOMPLETE)
+        raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
 
 
 def write_report(
@@ -47,7 +47,7 @@ def write_report(
     profile: str | None,
     unfinished: Sequence[str] = (),
 ) -> None:
-    """Judge the claims and write report.md and report.html beside the folder of the figures; print their paths."""
+    """Judge the claims, write report.md and report.html beside the folder of the figures, and print their paths."""
     from ssmail.paper.judgement import judge
     from ssmail.paper.report.contents import gather
     from ssmail.paper.report.pages import write
@@ -55,3 +55,42 @@ def write_report(
     contents = gather(store, figures, judge(store, profile), command, unfinished)
     for path in write(contents, out.parent):
         typer.echo(path)
+
+
+def draw_all(
+    store: "Store", out: Path, formats: Sequence[str], profile: str | None, statistic: "Statistic | None"
+) -> "list[Drawn]":
+    """Draw every figure of the paper from the runs that it selects by default."""
+    names = dict.fromkeys(figure.name for figure in FIGURES.values())
+    return [draw_or_report(name, store, None, out, formats, profile, statistic) for name in names]
+
+
+def draw_or_report(
+    name: str,
+    store: "Store",
+    runs: Sequence[str] | None,
+    out: Path,
+    formats: Sequence[str],
+    profile: str | None,
+    statistic: "Statistic | None",
+) -> "Drawn":
+    """Draw the figure and print its paths on stdout and its notes on stderr; or print on stderr why it is not drawn."""
+    from ssmail.paper.report.drawing import draw
+
+    try:
+        drawn = draw(name, store, runs, out, formats, profile=profile, statistic=statistic)
+    except Exception as error:  # must not stop the other figures
+        return not_drawn(name, error_line(error).removeprefix(f"{name} has nothing to draw: "))
+    for remark in drawn.notes:
+        note(f"{name}: {remark}")
+    for path in drawn.files:
+        typer.echo(path)
+    return drawn
+
+
+def not_drawn(name: str, reason: str) -> "Drawn":
+    """Report on stderr that the figure is not drawn, and return it without files."""
+    from ssmail.paper.report.drawing import Drawn
+
+    note(f"{name} is not drawn: {reason}")
+    return Drawn(name, lacks=reason)

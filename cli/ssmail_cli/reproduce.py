@@ -1,25 +1,24 @@
 """`ssmail reproduce`: the runs that figures and claims of the paper need, in one sweep; then figures and report."""
 
+import sys
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import redirect_stdout
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ssmail.errors import InputError, unknown_name
+from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
-from ssmail_cli import training_options as options
-from ssmail_cli.display import chosen_format, complaint, note, print_rows
-from ssmail_cli.drawing import draw_or_tell, undrawn
-from ssmail_cli.figure_options import DEFAULT_FORMATS, DEFAULT_OUT, Formats, OutDir, Stat, parse_statistic
-from ssmail_cli.options import DEFAULT_DATABASE, Database, Json, is_missing
-from ssmail_cli.progress import Sweep, label
-from ssmail_cli.report import write_report
-from ssmail_cli.reproduction_data import DataFiles, look_for_data, make_data, settled_runs, tell
-from ssmail_cli.sweep import SOME_RUNS_FAILED, Rows, compute, finish, is_interrupted, plan, result_rows
-from ssmail_cli.training_options import Device, parse_seeds, pick_device
+from ssmail_cli import options
+from ssmail_cli.datasets import prep_mocap
+from ssmail_cli.options import Device, is_missing, parse_seeds
+from ssmail_cli.output import chosen_format, error_line, note, print_rows
+from ssmail_cli.progress import Sweep
+from ssmail_cli.report import draw_or_report, not_drawn, write_report
+from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows, unfinished
 
 if TYPE_CHECKING:
     from ssmail.config.spec import RunSpec
@@ -28,109 +27,82 @@ if TYPE_CHECKING:
     from ssmail.paper.report.drawing import Drawn
     from ssmail.store import RunRow, Store
 
-FAILURE = 1
 SEEDS, FEWER_SEEDS = "0-4", {"smoke": "0-1"}  # with which a smoke ends within five minutes on two cores
 PLAN_COLUMNS = {"figure": "figure", "runs": "runs", "stored": "stored", "new": "new", "time": "time"}
 
+Only = Annotated[
+    str | None,
+    typer.Option("--only", metavar="FIGURE[,FIGURE...]", help="Only these figures, no report.", show_default="all"),
+]
+SeedsOfProfile = Annotated[
+    str | None, typer.Option("--seeds", help=options.SEEDS_HELP, show_default="0-4; with --profile smoke 0-1")
+]
+CmuDir = Annotated[
+    Path | None,
+    typer.Option(
+        "--cmu-dir",
+        envvar="SSMAIL_CMU_DIR",
+        help="Folder or zip file with 35.asf and 35_01.amc ...; makes data/mocap.npz if it does not exist.",
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print how many runs would be trained, and for how long.")]
+
 
 def reproduce(
-    only: Annotated[
-        str | None,
-        typer.Option(
-            "--only", metavar="FIGURE[,FIGURE...]", help="These figures alone, no report.", show_default="all of them"
-        ),
-    ] = None,
-    profile: options.ProfileName = "quick",
-    seeds: Annotated[
-        str | None,
-        typer.Option(
-            "--seeds", help="Seeds, one run each: 0-4, or 0,2,5, or 0-2,7.", show_default="0-4; of profile smoke 0-1"
-        ),
-    ] = None,
+    only: Only = None,
+    profile: options.TrainingProfile = "quick",
+    seeds: SeedsOfProfile = None,
     jobs: options.Jobs = 2,
     device: options.DeviceOption = Device.AUTO,
-    cmu: Annotated[
-        Path | None,
-        typer.Option(
-            "--cmu-dir",
-            envvar="SSMAIL_CMU_DIR",
-            help="Folder or zip file with 35.asf and 35_01.amc ...: makes data/mocap.npz when it is not there.",
-        ),
-    ] = None,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Print how many runs there are to train and how long that may take.")
-    ] = False,
-    as_json: Json = False,
-    out: OutDir = DEFAULT_OUT,
-    formats: Formats = DEFAULT_FORMATS,
-    stat: Stat = None,
-    db: Database = DEFAULT_DATABASE,
+    cmu: CmuDir = None,
+    dry_run: DryRun = False,
+    as_json: options.Json = False,
+    out: options.OutDir = options.DEFAULT_OUT,
+    formats: options.Formats = options.DEFAULT_FORMATS,
+    stat: options.StatOfFigures = None,
+    db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
 
-    Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: the same command goes
-    on where it was stopped or killed. A run that fails stops neither the others nor the figures. report.md and
-    report.html go beside the folder of the figures; with --only there is none, and `ssmail report` writes it of all
-    that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
-    paths of the files. Exit code 3: some runs did not finish, or figures were left out.
+    Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: after Ctrl-C or a kill,
+    the same command continues. A run that fails stops neither the others nor the figures. report.md and report.html go
+    beside the folder of the figures; with --only there is no report, and `ssmail report` writes one of all that is
+    stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the paths of
+    the files. Exit code 3: some runs did not finish, or figures were left out.
     """
-    from ssmail.execution.planning import check_labels, longest_first
-    from ssmail.store import Store
-
-    given = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
-    figures = _figures(only, profile, parse_seeds(given))
-    statistic = parse_statistic(stat)
-    if statistic is not None and not any(FIGURES[name].has_statistic for name in figures):
+    seeds = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
+    figures = _figures(only, profile, parse_seeds(seeds))
+    statistic = options.parse_statistic(stat)
+    if statistic and not any(FIGURES[name].has_statistic for name in figures):
         raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
-    data = look_for_data(figures, cmu)
+    data = _find_data(figures, cmu)
     if only is not None and set(data.missing) == set(figures):
         raise InputError(f"{next(iter(data.missing.values()))}.")
-    tell(data)
-    trained = {name: cells for name, cells in figures.items() if name not in data.missing}
-    needed = _merged(trained.values())
-    seconds = _seconds(_merged(figures.values()), db)
+    data.print()
     if dry_run:
-        _print_plan(figures, data, seconds, db, jobs, as_json)
+        _print_plan(figures, data, db, jobs, as_json)
         return
-    sweep = {cell: needed[cell] for cell in longest_first(list(needed), seconds)}
-    chosen_device = pick_device(device)
-    check_labels(sweep)
-    make_data(figures, data, cmu)
-    store = Store.open(db)
-    _wait(store, sweep)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, chosen_device))
-    if is_interrupted(rows):
-        finish(sweep, rows)
-    ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
-    ended |= settled_runs(store, _merged(figures[name] for name in data.missing))
+    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device))
+    runs = _settled_runs(store, figures, data, sweep, rows)
     drawn = [
-        _draw(store, name, cells, ended, data.missing.get(name), statistic, out, formats)
+        _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
         for name, cells in figures.items()
     ]
-    written = only is not None or _report(store, drawn, out, db, profile, given, sweep, rows)
+    command = f"ssmail reproduce --profile {profile} --seeds {seeds} --db {db}"
+    reported = only is not None or _write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
     finish(sweep, rows)
-    if not written or any(figure.lacks for figure in drawn if figure.name not in data.missing):
-        raise typer.Exit(FAILURE)
+    if not reported or any(figure.lacks for figure in drawn if figure.name not in data.missing):
+        raise typer.Exit(ExitCode.FAILURE)
     if data.missing:
-        raise typer.Exit(SOME_RUNS_FAILED)
-
-
-def _wait(store: "Store", sweep: Sweep) -> None:
-    """Let the processes of a reproduction that was killed a moment ago come to their end."""
-    from ssmail.execution.local import wait_for_others
-
-    def on_wait(run: "RunRow") -> None:
-        note(f"waiting up to half a minute for another process, at work or killed lately, to leave run {run.name}")
-
-    wait_for_others(store, sweep, on_wait)
+        raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
 
 
 def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
-    """The cells of each figure that is wanted, by its name in the paper."""
+    """Return the cells of each figure asked for, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
 
     listed = load_experiments().figures
-    choices = {key: module.name for key, module in FIGURES.items() if module.name in listed}
+    choices = {key: figure.name for key, figure in FIGURES.items() if figure.name in listed}
     wanted = [part.strip() for part in only.split(",")] if only is not None else list(choices)
     for name in wanted:
         if name not in choices:
@@ -139,7 +111,7 @@ def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, 
 
 
 def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
-    """The cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
+    """Return the cells that `figure` ("fig4") draws. Raises InputError for an unknown figure or profile."""
     from ssmail.execution.cells import Cell
     from ssmail.plots.series import figure_specs
 
@@ -151,7 +123,7 @@ def figure_cells(figure: str, profile: str, seeds: Sequence[int]) -> Sweep:
 
 
 def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
-    """Every cell once, under the names that it has where it comes first."""
+    """Return every cell once, under the names that it has where it comes first."""
     cells: dict[Cell, Any] = {}
     for sweep in sweeps:
         for cell, names in sweep.items():
@@ -159,8 +131,106 @@ def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
     return cells
 
 
+class _Data(NamedTuple):
+    """The data files that some figures need and that do not exist, as sentences without a full stop, by figure."""
+
+    made: dict[str, str]  # will be made before training
+    missing: dict[str, str]
+
+    def print(self) -> None:
+        """Print a line on stderr for each file that will be made, and for each figure whose data is missing."""
+        for sentence in dict.fromkeys(self.made.values()):
+            note(sentence)
+        for name, sentence in self.missing.items():
+            note(f"{name} is left out: {sentence}.")
+
+
+def _find_data(figures: Mapping[str, Sweep], cmu: Path | None) -> _Data:
+    """Look for the data files that the figures need. Raises InputError when `cmu` does not exist but is needed."""
+    found = _Data({}, {})
+    for name, sweep in figures.items():
+        for path, environment in sorted(_absent_files(sweep)):
+            if environment != "mocap":
+                found.missing[name] = f"there is no {path}, which experiments.yaml names; make it, or correct data.path"
+            elif cmu is None:
+                found.missing[name] = (
+                    f"there is no {path}; `ssmail prep-mocap --source DIR --out {path}` makes it from files of the CMU "
+                    "database, and --download fetches those (or give --cmu-dir DIR)"
+                )
+            elif not cmu.exists():
+                raise InputError(f"there is no {cmu}; --cmu-dir (or SSMAIL_CMU_DIR) names the folder or zip of 35.asf")
+            else:
+                found.made[name] = f"{path} is made from {cmu}"
+    return found
+
+
+def _absent_files(sweep: Sweep) -> set[tuple[str, str]]:
+    """Return (path, environment) of the data files of the cells that do not exist."""
+    needed = {(cell.spec.data.path, cell.spec.environment) for cell in sweep}
+    return {(path, environment) for path, environment in needed if path is not None and not Path(path).exists()}
+
+
+def _make_data(figures: Mapping[str, Sweep], data: _Data, cmu: Path | None) -> None:
+    """Make the sets of recorded walking that can be made, with the defaults of `ssmail prep-mocap`.
+
+    Raises InputError when a file of the CMU database is missing or damaged.
+    """
+    paths = {path for name in data.made for path, _ in _absent_files(figures[name])}
+    for path in sorted(paths):
+        with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
+            prep_mocap(source=cmu, out=Path(path))
+
+
+def _trainable(figures: Mapping[str, Sweep], data: _Data) -> Sweep:
+    """Return the cells whose data exists or will be made."""
+    return _merged(cells for name, cells in figures.items() if name not in data.missing)
+
+
+def _train(
+    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
+) -> "tuple[Store, Sweep, Rows]":
+    """Make the data and compute every cell, the longest first. Raises typer.Exit when interrupted."""
+    from ssmail.execution.planning import check_labels, longest_first
+    from ssmail.store import Store
+
+    needed = _trainable(figures, data)
+    sweep = {cell: needed[cell] for cell in longest_first(list(needed), _seconds(needed, db))}
+    check_labels(sweep)
+    _make_data(figures, data, cmu)
+    store = Store.open(db)
+    _wait_for_others(store, sweep)
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
+    if is_interrupted(rows):
+        finish(sweep, rows)
+    return store, sweep, rows
+
+
+def _wait_for_others(store: "Store", sweep: Sweep) -> None:
+    """Wait for the processes of a reproduction that was killed a moment ago to end."""
+    from ssmail.execution.local import wait_for_others
+
+    def on_wait(run: "RunRow") -> None:
+        note(f"waiting up to half a minute for another process, running or recently killed, to release run {run.name}")
+
+    wait_for_others(store, sweep, on_wait)
+
+
+def _settled_runs(
+    store: "Store", figures: Mapping[str, Sweep], data: _Data, sweep: Sweep, rows: Rows
+) -> "dict[Cell, str]":
+    """Return the run id of each cell that finished or diverged, stored runs of missing data included."""
+    ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
+    return ended | _stored_runs(store, _merged(figures[name] for name in data.missing))
+
+
+def _stored_runs(store: "Store", sweep: Sweep) -> "dict[Cell, str]":
+    """Return the run id of each cell whose newest run finished or diverged, whatever has become of its data."""
+    rows = {cell: store.find_cell(cell.spec.hash(), cell.seed) for cell in sweep}
+    return {cell: row.id for cell, row in rows.items() if row is not None and row.state.settled}
+
+
 def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
-    """How long a run of each spec takes, as far as the stored runs tell."""
+    """Estimate from the stored runs how long a run of each spec takes."""
     from ssmail.execution.planning import estimated_seconds
     from ssmail.store import Store
 
@@ -168,19 +238,12 @@ def _seconds(sweep: Sweep, db: str) -> "dict[RunSpec, float | None]":
     return estimated_seconds(runs, list(dict.fromkeys(cell.spec for cell in sweep)))
 
 
-def _print_plan(
-    figures: Mapping[str, Sweep],
-    data: DataFiles,
-    seconds: "Mapping[RunSpec, float | None]",
-    db: str,
-    jobs: int,
-    as_json: bool,
-) -> None:
-    """Print a row for each figure, as if it were alone, and one for all of them, in which shared runs count once."""
+def _print_plan(figures: Mapping[str, Sweep], data: _Data, db: str, jobs: int, as_json: bool) -> None:
+    """Print a row for each figure as if it were alone, and a total in which shared runs count once."""
+    every = _merged(figures.values())
+    stored, seconds = _stored_cells(every, data, db), _seconds(every, db)
     rows = []
-    trained = _merged(cells for name, cells in figures.items() if name not in data.missing)
-    stored = _stored(_merged(figures.values()), data, db)
-    for name, sweep in {**figures, "total": trained}.items():
+    for name, sweep in {**figures, "total": _trainable(figures, data)}.items():
         new = [cell for cell in sweep if cell not in stored]
         row = {"figure": name, "runs": len(sweep), "stored": len(sweep) - len(new), "new": len(new)}
         if name in data.missing:
@@ -190,19 +253,19 @@ def _print_plan(
     print_rows(rows, PLAN_COLUMNS, chosen_format(as_json, None))
 
 
-def _stored(sweep: Sweep, data: DataFiles, db: str) -> "set[Cell]":
-    """The cells that need not be computed. Those whose data is not there cannot be compared with it."""
+def _stored_cells(sweep: Sweep, data: _Data, db: str) -> "set[Cell]":
+    """Return the cells that need not be computed. Without the data files, their hashes cannot be compared."""
     from ssmail.store import Store
 
     if is_missing(db):
         return set()
     if data.made or data.missing:
-        return set(settled_runs(Store.open(db), sweep))
+        return set(_stored_runs(Store.open(db), sweep))
     return {cell for cell, (action, _) in plan(sweep, db, Resume.AUTO).items() if action == "skip"}
 
 
 def _time(each: "Sequence[float | None]", jobs: int) -> dict[str, Any]:
-    """The estimate of the runs of these seconds, `jobs` at a time: as a number (None: unknown) and in words."""
+    """Estimate the time of runs that take these seconds (None: unknown), `jobs` at once; as a number and in words."""
     from ssmail.execution.planning import total_seconds
 
     known = [value for value in each if value is not None]
@@ -216,41 +279,28 @@ def _draw(
     store: "Store",
     name: str,
     cells: Sweep,
-    ended: "Mapping[Cell, str]",
+    runs: "Mapping[Cell, str]",
     missing: str | None,
     statistic: "Statistic | None",
     out: Path,
     formats: Sequence[str],
 ) -> "Drawn":
-    """The figure from its own runs, as far as they ended. missing: what its data lacks, so that none was trained."""
-    ids = [ended[cell] for cell in cells if cell in ended]
+    """Draw the figure from those of its own cells that have a run; `missing` says what its data lacks."""
+    ids = [runs[cell] for cell in cells if cell in runs]
     if not ids:
-        return undrawn(name, f"{missing}." if missing else "none of its runs finished.")
+        return not_drawn(name, f"{missing}." if missing else "none of its runs finished.")
     if len(ids) < len(cells):
         note(f"{name}: {len(cells) - len(ids)} of its {len(cells)} runs are missing: not finished.")
-    return draw_or_tell(name, store, ids, out, formats, None, statistic)
+    return draw_or_report(name, store, ids, out, formats, None, statistic)
 
 
-def _report(
-    store: "Store",
-    figures: "Sequence[Drawn]",
-    out: Path,
-    db: str,
-    profile: str,
-    seeds: str,
-    sweep: Sweep,
-    rows: Rows,
+def _write_report(
+    store: "Store", figures: "Sequence[Drawn]", out: Path, command: str, profile: str, unfinished: Sequence[str]
 ) -> bool:
-    """Write the report; whether it could be written."""
-    unfinished = [
-        f"{label(names)} {row['outcome']}: {row['message']}"
-        for names, row in zip(sweep.values(), rows, strict=True)
-        if row["state"] != "finished"
-    ]
-    command = f"ssmail reproduce --profile {profile} --seeds {seeds} --db {db}"
+    """Write the report; return whether that worked."""
     try:
         write_report(store, figures, out, command, profile, unfinished)
-    except Exception as error:  # the figures are there
-        note(f"the report is not written: {complaint(error)}")
+    except Exception as error:  # the figures are drawn already
+        note(f"the report is not written: {error_line(error)}")
         return False
     return True

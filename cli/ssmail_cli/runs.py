@@ -10,8 +10,8 @@ import typer
 from ssmail.errors import InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
-from ssmail_cli.display import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
-from ssmail_cli.results import rows_with_metrics, run_row, shown_on
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
+from ssmail_cli.run_table import environment_metrics, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
@@ -52,7 +52,7 @@ def list_runs(
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
         note(f"no run in {db} meets these conditions")
-    errors = list(dict.fromkeys(shown_on(run.environment).error for run in runs))
+    errors = list(dict.fromkeys(environment_metrics(run.environment).error for run in runs))
     rows = rows_with_metrics(store, runs, errors)
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
@@ -224,7 +224,8 @@ def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> Non
     """Runs downwards, with one column for the test error, whatever it is called in the environment of each."""
     name = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
     short_rows = [
-        {**row, "spec": row["spec_hash"][:8], "error": row[shown_on(row["environment"]).error]} for row in rows
+        {**row, "spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
+        for row in rows
     ]
     print_table(short_rows, {**RUN_COLUMNS, "error": name})
 
@@ -239,7 +240,7 @@ def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] |
         for item in compare_runs(
             store,
             [run for run in runs if run.environment == environment],
-            metrics or list(shown_on(environment).metrics),
+            metrics or list(environment_metrics(environment).compared),
         )
     ]
 

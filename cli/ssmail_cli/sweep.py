@@ -1,6 +1,6 @@
-"""One resumable sweep over cells, for every command that trains: computed, shown as rows, and how the command ends.
+"""Sweeps: the cells that a command trains, computed, printed as rows, and how the command ends.
 
-A sweep is a dictionary from each cell to its names: what tells it from the other cells, as {"beta": 0.15, "seed": 2}.
+A sweep is a dictionary from each cell to what tells it from the others: {"beta": 0.15, "seed": 2}.
 """
 
 from collections.abc import Mapping, Sequence
@@ -8,19 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import ExitCode, InputError
 from ssmail.execution import Resume
-from ssmail_cli.display import chosen_format, note, print_rows
 from ssmail_cli.options import is_missing
+from ssmail_cli.output import chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
-from ssmail_cli.results import key_metrics, rows_with_metrics
+from ssmail_cli.run_table import key_metrics, rows_with_metrics
 
 if TYPE_CHECKING:
     from ssmail.execution.cells import Cell, Event
     from ssmail.store import Store
-
-SOME_RUNS_FAILED = 3
-INTERRUPTED = 130
 
 Rows = list[dict[str, Any]]
 
@@ -33,12 +30,12 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, a
     check_labels(sweep)  # before there is a database
     store = Store.open(db)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
-    print_rows(rows, {**_heading(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
+    print_rows(rows, {**_name_columns(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
     return rows
 
 
 def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str) -> "list[Event]":
-    """Compute every cell, with its progress on stderr; the final event of each, in the order of the sweep."""
+    """Compute every cell, with progress on stderr; return their final events in the order of the sweep."""
     from ssmail.execution.local import run_cells
 
     with reporter(sweep) as report:
@@ -46,7 +43,7 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str
 
 
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
-    """A row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
+    """Return a row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
     runs = store.runs(ids=[event.run_id for event in events if event.run_id])
     names = [*key_metrics(_environments(sweep)), "best_epoch"]
     stored = {row["id"]: row for row in rows_with_metrics(store, runs, names)}
@@ -58,35 +55,44 @@ def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows
 
 
 def is_interrupted(rows: Rows) -> bool:
-    """Whether the sweep was stopped before its end."""
+    """Return whether the sweep was stopped before its end."""
     return any(row["outcome"] == "interrupted" for row in rows)
 
 
+def unfinished(sweep: Sweep, rows: Rows) -> list[str]:
+    """Return a line for each run that did not finish."""
+    return [
+        f"{label(names)} {row['outcome']}: {row['message']}"
+        for names, row in zip(sweep.values(), rows, strict=True)
+        if row["state"] != "finished"
+    ]
+
+
 def finish(sweep: Sweep, rows: Rows) -> None:
-    """End the command: say which runs did not finish, and raise typer.Exit when there are such."""
+    """End the command: print the runs that did not finish, and raise typer.Exit if there are any."""
     if is_interrupted(rows):
         note("interrupted; the same command continues where it stopped")
-        raise typer.Exit(INTERRUPTED)
-    unfinished = [(names, row) for names, row in zip(sweep.values(), rows, strict=True) if row["state"] != "finished"]
-    for names, row in unfinished:
-        note(f"{label(names)} {row['outcome']}: {row['message']}")
-    if unfinished:
-        raise typer.Exit(SOME_RUNS_FAILED)
+        raise typer.Exit(ExitCode.INTERRUPTED)
+    lines = unfinished(sweep, rows)
+    for line in lines:
+        note(line)
+    if lines:
+        raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
 
 
 def print_plan(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
-    """Print what training would do with each cell, without making a database."""
+    """Print what training would do with each cell, without creating a database."""
     actions = plan(sweep, db, resume)
     rows = [
         {**names, "action": action, "run": run and run[:8], "spec_hash": cell.spec.hash()}
         for (cell, names), (action, run) in zip(sweep.items(), actions.values(), strict=True)
     ]
-    columns = {**_heading(sweep), "action": "would", "run": "run", "spec_hash": "spec"}
+    columns = {**_name_columns(sweep), "action": "would", "run": "run", "spec_hash": "spec"}
     print_rows(rows, columns, chosen_format(as_json, None))
 
 
 def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | None]]":
-    """For each cell "new", "skip" or "resume", and the id of the run that there is; no database is made."""
+    """Return "new", "skip" or "resume" for each cell, and the id of its stored run; no database is created."""
     from ssmail.execution.planning import check_labels, plan_cell
     from ssmail.store import Store
 
@@ -115,5 +121,5 @@ def _result_columns(sweep: Sweep) -> dict[str, str]:
     return {"outcome": "outcome", "run": "run", **metrics, "wall_seconds": "seconds"}
 
 
-def _heading(sweep: Sweep) -> Mapping[str, str]:
+def _name_columns(sweep: Sweep) -> Mapping[str, str]:
     return {name: name for names in sweep.values() for name in names}

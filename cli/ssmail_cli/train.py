@@ -1,32 +1,49 @@
-"""`ssmail train`: one spec, several seeds, into the store."""
+"""`ssmail train` and `ssmail ablate`: sweeps over seeds, and over values of one key, into the store."""
 
-from typing import Annotated
+import sys
+from dataclasses import fields
+from typing import Annotated, Any
 
 import typer
 
+from ssmail.errors import InputError
 from ssmail.execution import Resume
-from ssmail_cli import training_options as options
-from ssmail_cli.options import DEFAULT_DATABASE, Database, Json
-from ssmail_cli.sweep import finish, print_plan, train_sweep
-from ssmail_cli.training_options import Device, parse_seeds, pick_device
+from ssmail.paper.results import FIGURES
+from ssmail_cli import options
+from ssmail_cli.options import Device, parse_seeds, pick_device
+from ssmail_cli.output import note
+from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
+
+Values = Annotated[
+    str | None,
+    typer.Option(
+        "--values",
+        help="The values: 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once.",
+        show_default="those of experiments.yaml",
+    ),
+]
+AblationEnvironment = Annotated[
+    str | None,
+    typer.Option("--env", help="Train on this environment.", show_default="the ablation's in experiments.yaml"),
+]
 
 
 def train(
     method: Annotated[str, typer.Option("--method", help="The method to train.")] = "ssail",
     environment: Annotated[str, typer.Option("--env", help="The environment to train on.")] = "yjunction",
-    profile: options.ProfileName = "quick",
+    profile: options.TrainingProfile = "quick",
     seeds: options.Seeds = "0",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = Device.AUTO,
     dry_run: options.DryRun = False,
-    as_json: Json = False,
-    db: Database = DEFAULT_DATABASE,
+    as_json: options.Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Train a method for some seeds into the store.
+    """Train a method with one or several seeds.
 
-    A run is its spec and its seed: a finished one is skipped, an unfinished one is resumed. Ctrl-C saves and stops.
+    A spec and a seed make a run: finished runs are skipped, unfinished ones resumed. Ctrl-C saves and stops.
     """
     from ssmail.config.experiments import build_spec
     from ssmail.execution.cells import Cell
@@ -38,3 +55,105 @@ def train(
         print_plan(sweep, db, resume, as_json)
         return
     finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json))
+
+
+def ablate(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="alpha, beta, curriculum or label, or one of your experiments.yaml.")
+    ],
+    values: Values = None,
+    environment: AblationEnvironment = None,
+    profile: options.TrainingProfile = "quick",
+    seeds: options.Seeds = "0-4",
+    jobs: options.Jobs = 1,
+    settings: options.Settings = None,
+    resume: options.ResumeOption = Resume.AUTO,
+    device: options.DeviceOption = Device.AUTO,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Train a method for several values of one key of its spec.
+
+    Each value and seed make a run: finished runs are skipped, unfinished ones resumed. Ctrl-C saves and stops. The
+    ablations are entries of experiments.yaml; `ssmail ablate-beta` is short for `ssmail ablate beta`.
+    """
+    from ssmail.config.experiments import ablation, ablation_specs, display_value
+    from ssmail.execution.cells import Cell
+
+    chosen_seeds = parse_seeds(seeds)
+    column = _column(ablation(name, environment).key)
+    chosen_values = None if values is None else parse_values(values)
+    specs = ablation_specs(name, profile, chosen_values, settings or [], environment=environment)
+    sweep = {
+        Cell(spec, seed): {column: display_value(value), "seed": seed}
+        for value, spec in specs.items()
+        for seed in chosen_seeds
+    }
+    if dry_run:
+        print_plan(sweep, db, resume, as_json)
+        return
+    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
+    if sys.stdout.isatty() and not is_interrupted(rows):
+        _point_to_figures(name, environment, db)
+    finish(sweep, rows)
+
+
+def ablate_alias(
+    ctx: typer.Context,
+    values: Values = None,
+    environment: AblationEnvironment = None,
+    profile: options.TrainingProfile = "quick",
+    seeds: options.Seeds = "0-4",
+    jobs: options.Jobs = 1,
+    settings: options.Settings = None,
+    resume: options.ResumeOption = Resume.AUTO,
+    device: options.DeviceOption = Device.AUTO,
+    dry_run: options.DryRun = False,
+    as_json: options.Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Run `ablate` under the name of an ablation: `ablate-beta` is `ablate beta`."""
+    name = str(ctx.info_name).removeprefix("ablate-")
+    ablate(name, values, environment, profile, seeds, jobs, settings, resume, device, dry_run, as_json, db)
+
+
+def parse_values(text: str) -> list[Any]:
+    """ "0,0.1" -> [0, 0.1] and "[0,1],[-1,1]" -> [[0, 1], [-1, 1]], as a YAML list without its brackets.
+
+    Raises InputError for an invalid or empty list, or an empty item.
+    """
+    import yaml
+
+    from ssmail.config import strict_yaml
+
+    try:
+        values = strict_yaml.parse(f"[{text}\n]")  # the line ends a comment, which would hide the bracket
+    except yaml.YAMLError:
+        values = None
+    if not values or None in values or text.rstrip().endswith(","):
+        raise InputError(f"--values takes values with commas between them, such as 0,0.15,1, not '{text}'.")
+    return list(values)
+
+
+def _column(key: str) -> str:
+    """Return the heading of the varied key: its last part, or all of it where that is the name of another column."""
+    from ssmail.store import RunRow
+
+    last = key.rpartition(".")[2]
+    taken = {"name", "run", "outcome", "action", "message", *(field.name for field in fields(RunRow))}
+    return key if last in taken else last
+
+
+def _point_to_figures(name: str, environment: str | None, db: str) -> None:
+    """Print the command for each figure that draws the ablation on that environment."""
+    from ssmail.config.experiments import ablation, figure_requirements
+    from ssmail.config.experiments_file import load_experiments
+
+    trained = ablation(name, environment).environment
+    database = "" if db == options.DEFAULT_DATABASE else f" --db {db}"
+    for figure in load_experiments().figures:
+        needed = figure_requirements(figure)
+        own = needed.environment == trained
+        if figure in FIGURES and needed.ablation == name and (own or FIGURES[figure].has_environment):
+            note(f"`ssmail plot {figure}{'' if own else f' --env {trained}'}{database}` draws these runs")

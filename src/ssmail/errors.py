@@ -2,18 +2,29 @@
 
 import difflib
 from collections.abc import Iterable
+from enum import IntEnum
+
+
+class ExitCode(IntEnum):
+    """How a command ends."""
+
+    OK = 0
+    FAILURE = 1
+    BAD_INPUT = 2
+    SOME_RUNS_FAILED = 3  # or figures are missing
+    INTERRUPTED = 130
 
 
 class SsmailError(Exception):
-    """A failure that the user's input did not cause (exit code 1)."""
+    """A failure that the user's input did not cause."""
 
-    exit_code = 1
+    exit_code = ExitCode.FAILURE
 
 
 class InputError(SsmailError):
-    """A value, file, key or path from the user cannot be used (exit code 2)."""
+    """A value, file, key or path from the user cannot be used."""
 
-    exit_code = 2
+    exit_code = ExitCode.BAD_INPUT
 
 
 def suggestion(name: str, choices: Iterable[str]) -> str:

@@ -149,7 +149,9 @@ def test_without_a_command_the_help_is_shown(cli: CommandLine) -> None:
         ("reproduce --profile quik", "unknown profile 'quik'; did you mean quick?"),
         ("reproduce --seeds 4-0", "the range 4-0 in --seeds runs backwards"),
         ("plot", "missing command."),
-        ("plot --out x", "`ssmail plot` has no option --out"),
+        ("plot --out x", "missing command."),
+        ("plot --ot x", "`ssmail plot` has no option --ot; did you mean --out?"),
+        ("plot fig4 --out", "option '--out' requires an argument."),
         ("plot fig55", "unknown figure 'fig55'; did you mean fig5?"),
     ],
 )

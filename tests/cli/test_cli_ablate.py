@@ -17,8 +17,8 @@ from ssmail.config.experiments_file import load_experiments
 from ssmail.errors import InputError
 from ssmail.execution import Resume
 from ssmail.store import Store
-from ssmail_cli.ablate import parse_values
 from ssmail_cli.progress import FEW
+from ssmail_cli.train import parse_values
 from tests.cli.command_line import CommandLine, FakeTraining
 
 SMOKE = ("ablate", "beta", "--profile", "smoke", "--device", "cpu")

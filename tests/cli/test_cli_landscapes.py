@@ -95,7 +95,7 @@ def test_all_ends_well_when_nothing_is_missing(
     cli: CommandLine, run: str, where: tuple[object, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     there = {name: module for name, module in FIGURES.items() if module.name in ("fig4", "fig9")}
-    monkeypatch.setattr("ssmail.paper.results.FIGURES", there)
+    monkeypatch.setattr("ssmail_cli.report.FIGURES", there)
     outcome = cli("plot", "all", "--stat", "mean-ci", *where)
     assert (outcome.code, "is not drawn" in outcome.err) == (0, False)
 

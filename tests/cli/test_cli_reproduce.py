@@ -17,8 +17,8 @@ from tests.paper.handmade_arrays import forecasts
 
 SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
 LEFT_OUT = (
-    "is left out: there is no data/mocap.npz; `ssmail prep-mocap --source DIR --out data/mocap.npz` makes it of files "
-    "of the CMU database, and --download fetches those (or give --cmu-dir DIR)."
+    "is left out: there is no data/mocap.npz; `ssmail prep-mocap --source DIR --out data/mocap.npz` makes it from "
+    "files of the CMU database, and --download fetches those (or give --cmu-dir DIR)."
 )
 
 

@@ -13,11 +13,11 @@ import pytest
 
 from ssmail.config.experiments import build_spec
 from ssmail.store import RunState, Store
-from ssmail_cli.results import SHOWN
+from ssmail_cli.run_table import ENVIRONMENT_METRICS
 from tests.cli.command_line import CommandLine
 
 ERRORS = {0: 0.004, 1: 0.006, 2: 0.011}
-KEY_METRICS = list(SHOWN["yjunction"].metrics)
+KEY_METRICS = list(ENVIRONMENT_METRICS["yjunction"].compared)
 AddRun = Callable[..., str]
 
 
@@ -42,9 +42,9 @@ def add(store: Store) -> AddRun:
         writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
         for epoch in (1, 2, 3):
             losses = {"critic/loss": math.inf if epoch == 2 else 0.5}
-            writer.epoch(epoch, {SHOWN[environment].validation: error * epoch, **losses})
+            writer.epoch(epoch, {ENVIRONMENT_METRICS[environment].validation: error * epoch, **losses})
         if state is RunState.FINISHED:
-            writer.final(3, dict.fromkeys(SHOWN[environment].metrics, error))
+            writer.final(3, dict.fromkeys(ENVIRONMENT_METRICS[environment].compared, error))
         if state is not RunState.RUNNING:
             writer.finish(state, None if state is RunState.FINISHED else f"it {state}")
         return writer.run_id
@@ -241,7 +241,7 @@ def test_each_environment_is_compared_by_its_own_metrics(
     assert [environment for environment, _ in by_spec] == ["yjunction", "yjunction", "mocap", "mocap"]
     for environment, spec in by_spec:
         found = [row["metric"] for row in runs("compare").rows if row["spec_hash"] == spec]
-        assert found == list(SHOWN[environment].metrics)
+        assert found == list(ENVIRONMENT_METRICS[environment].compared)
     monkeypatch.setenv("COLUMNS", "200")
     table = runs("compare", "--format", "table").out
     _, lanes, motion = table.split(": mean ± standard deviation")

@@ -20,12 +20,9 @@ def data(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_needs_neither_runs_nor_a_database(
-    cli: CommandLine, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_needs_neither_runs_nor_a_database(cli: CommandLine, data: Path, tmp_path: Path) -> None:
     out, nowhere = tmp_path / "figures", tmp_path / "absent.db"
-    monkeypatch.setenv("SSMAIL_DB", str(nowhere))
-    outcome = cli("plot", "skeleton", "--data", data, "--out", out, "--format", "svg")
+    outcome = cli("plot", "skeleton", "--data", data, "--out", out, "--db", nowhere, "--format", "svg")
     assert outcome.code == 0
     assert [Path(line).name for line in outcome.out.splitlines()] == ["skeleton_test-0.svg", "skeleton_test-0.csv"]
     assert outcome.err == "skeleton: test window 0 of 0-0: trial 35_03 from frame 2 on.\n"

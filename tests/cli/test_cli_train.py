@@ -12,7 +12,7 @@ import torch
 from ssmail.errors import InputError
 from ssmail.execution import Resume, local
 from ssmail.store import Store
-from ssmail_cli.training_options import MOST_SEEDS, parse_seeds
+from ssmail_cli.options import MOST_SEEDS, parse_seeds
 from tests.cli.command_line import CommandLine, FakeTraining
 
 SMOKE = ("train", "--profile", "smoke", "--device", "cpu")

@@ -12,8 +12,8 @@ The CSV and the notes have the numbers of every seed: the stored metrics `landsc
 `landscape/cosine`, after the last epoch and after the epoch that figure 2 shows, and the slope share at other
 thresholds.
 
-Deviation: ssail is trained as in A.2 (alpha in [-1, 1.5], reward 0 above 1) on every environment for which
-experiments.yaml sets that, not on this one alone.
+Deviation: ssail is trained as in A.2 (alpha in [-1, 1.5], reward 0 above 1) only if experiments.yaml says so for the
+environment that is drawn.
 
 Claim C7: GAIL's reward is nearly flat, SS-AIL's slopes towards the expert everywhere. A slope is usable when it is at
 least a quarter of what an even rise over the plane would have (`ssmail.evaluation.landscape`); the cosine is that

@@ -113,9 +113,9 @@ def largest_jump(lengths: Floats) -> float:
 def samples(runs: Runs) -> tuple[Sample, ...]:
     """Growth and largest jump under FORCING, and the largest jump under SAMPLING."""
     return (
-        runs.curves(FORCING, [MEASURED], growth, diverged=LEAST),
-        runs.curves(FORCING, [MEASURED], largest_jump, diverged=WORST),
-        runs.curves(SAMPLING, [MEASURED], largest_jump, diverged=LEAST),
+        runs.computed(FORCING, runs.curve, [MEASURED], growth, diverged=LEAST),
+        runs.computed(FORCING, runs.curve, [MEASURED], largest_jump, diverged=WORST),
+        runs.computed(SAMPLING, runs.curve, [MEASURED], largest_jump, diverged=LEAST),
     )
 
 

@@ -117,8 +117,8 @@ def samples(runs: Runs) -> tuple[tuple[Sample, ...], tuple[Sample, ...]]:
     """Remaining errors and fluctuations, each in the order of METHODS."""
     errors = (METRIC, "validation/mode_mse", f"{REFERENCE}/mode_mse")
     return (
-        tuple(runs.curves(method, errors, remaining_error, diverged=WORST) for method in METHODS),
-        tuple(runs.curves(method, [METRIC], fluctuation, diverged=WORST) for method in METHODS),
+        tuple(runs.computed(method, runs.curve, errors, remaining_error, diverged=WORST) for method in METHODS),
+        tuple(runs.computed(method, runs.curve, [METRIC], fluctuation, diverged=WORST) for method in METHODS),
     )
 
 

@@ -201,7 +201,7 @@ def samples(runs: Runs) -> tuple[Sample, ...]:
     return (
         runs.metric("ssail", ON_LANE, diverged=LEAST),
         runs.metric("ssail", LANE_BALANCE, diverged=LEAST),
-        runs.arrays("dnri", [ROLLOUTS, LANES], share_between, diverged=LEAST),
+        runs.computed("dnri", runs.array, [ROLLOUTS, LANES], share_between, diverged=LEAST),
     )
 
 

@@ -266,11 +266,11 @@ def _told(slopes: Slopes) -> str:
 def samples(runs: Runs) -> tuple[Sample, ...]:
     """Growth of dnri's error and spread, bending and late slope of ssail's error, and late slope of dnri's."""
     return (
-        runs.arrays("dnri", [NOISY], slope, diverged=WORST),
-        runs.arrays("dnri", [SPREAD], slope, diverged=WORST),
-        runs.arrays("ssail", [NOISY], bending, diverged=WORST),
-        runs.arrays("ssail", [NOISY], late_slope, diverged=WORST),
-        runs.arrays("dnri", [NOISY], late_slope, diverged=WORST),
+        runs.computed("dnri", runs.array, [NOISY], slope, diverged=WORST),
+        runs.computed("dnri", runs.array, [SPREAD], slope, diverged=WORST),
+        runs.computed("ssail", runs.array, [NOISY], bending, diverged=WORST),
+        runs.computed("ssail", runs.array, [NOISY], late_slope, diverged=WORST),
+        runs.computed("dnri", runs.array, [NOISY], late_slope, diverged=WORST),
     )
 
 

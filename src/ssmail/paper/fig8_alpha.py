@@ -147,7 +147,7 @@ def samples(runs: Runs) -> tuple[Sample, ...]:
 
     def of_each_range(number: Callable[[Floats], float]) -> list[Sample]:
         return [
-            runs.curves(alpha, ["train/mse"], number, diverged=WORST, label=f"alpha {setting(alpha)}")
+            runs.computed(alpha, runs.curve, ["train/mse"], number, diverged=WORST, label=f"alpha {setting(alpha)}")
             for alpha in (BOTH, POSITIVE)
         ]
 

@@ -61,39 +61,35 @@ class Runs:
 
         return self._sample(group, label, value, diverged)
 
-    def curves(
+    def computed(
         self,
         group: Any,
+        read: Callable[[RunRow, str], Array],
         names: Sequence[str],
         number: Callable[..., float],
         *,
         diverged: float,
         label: str | None = None,
     ) -> Sample:
-        """Sample `number` of the metrics of these names, each (E,) values over the epochs."""
+        """Sample `number` of what `read`, that is `curve` or `array`, returns for each of these names."""
 
-        def read(run: RunRow) -> list[Array]:
-            curves = (self.store.metrics([run.id], names=[name])["value"] for name in names)
-            return [curve.to_numpy(dtype=np.float64) for curve in curves]
+        def value(run: RunRow) -> float:
+            values = [read(run, name) for name in names]
+            if not all(len(found) for found in values):
+                return np.nan
+            found = number(*values)
+            lost = np.isnan(found) and not all(np.isfinite(array).all() for array in values)
+            return diverged if lost else found
 
-        return self._sample(group, label, _computed(read, number, diverged), diverged)
+        return self._sample(group, label, value, diverged)
 
-    def arrays(
-        self,
-        group: Any,
-        names: Sequence[str],
-        number: Callable[..., float],
-        *,
-        diverged: float,
-        label: str | None = None,
-    ) -> Sample:
-        """Sample `number` of the arrays of these names, which every run stores at its end."""
+    def curve(self, run: RunRow, name: str) -> Array:
+        """(E,) values of the run's metric over the epochs; empty when it has none."""
+        return self.store.metrics([run.id], names=[name])["value"].to_numpy(dtype=np.float64)
 
-        def read(run: RunRow) -> list[Array]:
-            there = {*names} <= {*self.store.array_names(run.id)}
-            return [self.store.array(run.id, name) if there else np.empty(0) for name in names]
-
-        return self._sample(group, label, _computed(read, number, diverged), diverged)
+    def array(self, run: RunRow, name: str) -> Array:
+        """The array of that name that the run stored; empty when there is none."""
+        return self.store.array(run.id, name) if name in self.store.array_names(run.id) else np.empty(0)
 
     def _group(self, key: Any) -> Group:
         for group in self.selection.groups:
@@ -109,22 +105,6 @@ class Runs:
             values=tuple(diverged if run.state is RunState.DIVERGED else value(run) for run in runs),
             runs=tuple(run.id for run in runs),
         )
-
-
-def _computed(
-    read: Callable[[RunRow], list[Array]], number: Callable[..., float], diverged: float
-) -> Callable[[RunRow], float]:
-    """Return the function that computes a finished run's number from the values that `read` returns."""
-
-    def value(run: RunRow) -> float:
-        values = read(run)
-        if not all(len(found) for found in values):
-            return np.nan
-        found = number(*values)
-        lost = np.isnan(found) and not all(np.isfinite(array).all() for array in values)
-        return diverged if lost else found
-
-    return value
 
 
 def end_mean(values: Floats) -> float:

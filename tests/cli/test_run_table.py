@@ -8,7 +8,7 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.spec import ENVIRONMENTS
 from ssmail.training.loop import TrainingLoop
 from ssmail_cli.progress import LABELS
-from ssmail_cli.results import SHOWN, key_metrics, shown_on
+from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics, key_metrics
 from tests.data.mocap.handmade import write_set
 
 
@@ -19,18 +19,18 @@ def test_what_is_shown_is_recorded(environment: str, tmp_path: Path) -> None:
         windows = write_set(tmp_path / "mocap.npz", frames=(101, 51, 101), window=50, test_window=100)
         overrides = [f"data.path={windows}", "forecast.predicted=40"]
     loop = TrainingLoop(build_spec("constant-velocity", environment, "smoke", overrides), 0)
-    shown = SHOWN[environment]
+    shown = ENVIRONMENT_METRICS[environment]
     assert {shown.validation, shown.curve} <= loop.evaluator.epoch(loop.learner.predictor).keys()
     assert shown.validation in LABELS
     final, _ = loop.final_evaluation()
-    assert shown.error in shown.metrics
-    assert shown.metrics.keys() <= final.keys()
+    assert shown.error in shown.compared
+    assert shown.compared.keys() <= final.keys()
 
 
 def test_metrics_that_environments_share_come_once() -> None:
-    assert list(SHOWN) == list(ENVIRONMENTS)
+    assert list(ENVIRONMENT_METRICS) == list(ENVIRONMENTS)
     both = key_metrics(ENVIRONMENTS)
-    assert set(both) == {name for shown in SHOWN.values() for name in shown.metrics}
-    assert list(key_metrics(["mocap"])) == list(SHOWN["mocap"].metrics)
+    assert set(both) == {name for shown in ENVIRONMENT_METRICS.values() for name in shown.compared}
+    assert list(key_metrics(["mocap"])) == list(ENVIRONMENT_METRICS["mocap"].compared)
     assert key_metrics([]) == {}
-    assert shown_on("football") is SHOWN["yjunction"]
+    assert environment_metrics("football") is ENVIRONMENT_METRICS["yjunction"]

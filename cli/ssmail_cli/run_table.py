@@ -1,4 +1,4 @@
-"""Stored runs as rows to print, and which of their metrics people want to see."""
+"""Stored runs as rows to print, and the metrics shown of each environment."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -9,25 +9,25 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Shown:
-    """What is shown of the runs on one environment, by the names of stored metrics.
+class EnvironmentMetrics:
+    """The metrics that the command line shows of one environment, by their stored names.
 
-    error: the one number of a finished run. validation: that of an epoch. curve: what `ssmail plot training` draws.
-    metrics: what is compared, each with its heading in the table of a training command (None: it is not in there).
+    error: the test error of a finished run. validation: the error of an epoch. curve: drawn by `ssmail plot training`.
+    compared: shown by `ssmail runs compare`, each with its heading in the table of a training command (None: none).
     """
 
     error: str
     validation: str
     curve: str
-    metrics: Mapping[str, str | None]
+    compared: Mapping[str, str | None]
 
 
-SHOWN = {
-    "yjunction": Shown(
+ENVIRONMENT_METRICS = {
+    "yjunction": EnvironmentMetrics(
         error="test/mode_mse",
         validation="validation/mode_mse",
         curve="train/mode_mse",
-        metrics={
+        compared={
             "test/mode_mse": "mode_mse",
             "test/on_lane": "on_lane",
             "test/lane_balance": "balance",
@@ -36,11 +36,11 @@ SHOWN = {
             "test_constant_velocity/mode_mse": "const.\nvelocity",
         },
     ),
-    "letters": Shown(
+    "letters": EnvironmentMetrics(
         error="test/stroke_distance",
         validation="validation/stroke_distance",
         curve="validation/stroke_distance",
-        metrics={
+        compared={
             "test/stroke_distance": "stroke\ndistance",
             "test_mean/stroke_distance": "by the\nmean",
             "test_last/stroke_distance": "last\nepoch",
@@ -49,11 +49,11 @@ SHOWN = {
             "test/diverged": "diverged",
         },
     ),
-    "mocap": Shown(
+    "mocap": EnvironmentMetrics(
         error="test/mse_40",
         validation="validation/mse",
         curve="validation/mse",
-        metrics={
+        compared={
             "test/mse_10": "mse_10",
             "test/mse_20": "mse_20",
             "test/mse_40": "mse_40",
@@ -65,23 +65,27 @@ SHOWN = {
 }
 
 
-def shown_on(environment: str) -> Shown:
-    """The row of SHOWN; that of the Y-Junction for an environment that this ssmail does not know."""
-    return SHOWN.get(environment, SHOWN["yjunction"])
+def environment_metrics(environment: str) -> EnvironmentMetrics:
+    """Return the metrics of the environment; for an unknown one those of the Y-Junction."""
+    return ENVIRONMENT_METRICS.get(environment, ENVIRONMENT_METRICS["yjunction"])
 
 
 def key_metrics(environments: Iterable[str]) -> dict[str, str | None]:
-    """The metrics of all of these environments, each once, with their headings."""
-    return {name: heading for environment in environments for name, heading in shown_on(environment).metrics.items()}
+    """Return the compared metrics of all of these environments, each once, with their headings."""
+    return {
+        name: heading
+        for environment in environments
+        for name, heading in environment_metrics(environment).compared.items()
+    }
 
 
 def run_row(run: "RunRow") -> dict[str, Any]:
-    """Return the columns of a stored run by name, except the long spec and the owner, a random number."""
+    """Return the columns of a stored run by name, without its spec and its owner."""
     return {item.name: getattr(run, item.name) for item in fields(run) if item.name not in ("spec_json", "owner")}
 
 
 def rows_with_metrics(store: "Store", runs: "Sequence[RunRow]", names: Sequence[str]) -> list[dict[str, Any]]:
-    """A row for each run: its short id as `run`, its columns, and the last value of each named metric or None."""
+    """Return a row for each run: its short id as `run`, its columns, and the last value of each metric or None."""
     from ssmail.store.comparison import latest_values
 
     latest = latest_values(store, runs, names)

@@ -1,4 +1,4 @@
-"""How results look on stdout: a table for people, CSV or JSON for programs. And how notes go to stderr."""
+"""Results on stdout, as a table for people or as CSV or JSON for programs; notes on stderr."""
 
 import csv
 import json
@@ -28,19 +28,19 @@ class Format(StrEnum):
 
 
 def chosen_format(as_json: bool, chosen: Format | None) -> Format:
-    """What the user asked for; else a table on a terminal and CSV elsewhere."""
+    """Return the format asked for; by default a table on a terminal and CSV elsewhere."""
     if as_json:
         return Format.JSON
     return chosen or (Format.TABLE if sys.stdout.isatty() else Format.CSV)
 
 
 def note(text: str) -> None:
-    """A remark beside the result: one line on stderr."""
+    """Print a remark on stderr, beside the result."""
     print(text, file=sys.stderr)
 
 
-def complaint(error: Exception) -> str:
-    """What to tell of an error in one line. With SSMAIL_DEBUG=1 an error that nobody foresaw is raised again."""
+def error_line(error: Exception) -> str:
+    """Return the error as one line. With SSMAIL_DEBUG=1, an unexpected error is raised again."""
     if isinstance(error, SsmailError):
         return str(error)
     if os.environ.get("SSMAIL_DEBUG"):
@@ -50,7 +50,7 @@ def complaint(error: Exception) -> str:
 
 
 def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
-    """Print rows; `columns` maps the keys that a table shows to headings. CSV and JSON have every key of the rows."""
+    """Print rows. `columns` maps the keys that a table shows to their headings; CSV and JSON have every key."""
     if form is Format.TABLE:
         print_table(rows, columns)
     elif form is Format.CSV:
@@ -60,24 +60,24 @@ def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) ->
 
 
 def write_csv(rows: Iterable[Row], columns: Sequence[str], out: Path | None) -> None:
-    """CSV with a header, to a file or (None) to stdout; None is empty, NaN is nan, times are ISO 8601."""
+    """Write CSV with a header to a file, or to stdout (None). None becomes empty, NaN nan, a time ISO 8601."""
 
     def write(file: Any) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([_csv_cell(row.get(column)) for column in columns] for row in rows)
 
-    _to(out, write)
+    _write_to(out, write)
 
 
 def write_json(value: Any, out: Path | None) -> None:
-    """JSON to a file or (None) to stdout; NaN and infinities become the texts nan, inf and -inf, as JSON has none."""
-    _to(out, lambda file: print(json.dumps(_json_value(value), indent=2), file=file))
+    """Write JSON to a file, or to stdout (None). NaN and infinities become the strings nan, inf and -inf."""
+    _write_to(out, lambda file: print(json.dumps(_json_value(value), indent=2), file=file))
 
 
 def short(value: Any, digits: int = 4) -> str:
-    """A value as a table shows it: so many significant digits, month to minute of UTC, a dash for nothing; or a list
-    of such.
+    """Return a value as a table shows it: a number to `digits` significant digits, a time from month to minute, a dash
+    for nothing; a list item by item.
     """
     if value is None or value == "":
         return "-"
@@ -91,9 +91,7 @@ def short(value: Any, digits: int = 4) -> str:
 
 
 def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
-    """A table on stdout: columns two spaces apart and four digits, or, in a terminal too narrow for it, one space, or
-    one space and three digits.
-    """
+    """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits."""
     from rich.console import Console
     from rich.measure import Measurement
 
@@ -119,7 +117,7 @@ def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: in
 
 
 def _plain(text: str) -> Any:
-    """Text that Rich must not read as markup."""
+    """Return text that Rich does not read as markup."""
     from rich.text import Text
 
     return Text(text)
@@ -143,7 +141,7 @@ def _json_value(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _to(out: Path | None, write: Any) -> None:
+def _write_to(out: Path | None, write: Any) -> None:
     if out is None:
         write(sys.stdout)
         return
