@@ -1,6 +1,6 @@
 """dnri's training step in the fast form of its message passing beside the readable one (message_passing.FAST).
 
-Both forms use the same weights and take turns. CPU seconds, so that other programs disturb them less.
+Both forms use the same weights and take turns. The times are CPU seconds, which other programs disturb less.
 """
 
 import statistics
@@ -31,7 +31,7 @@ Work = Callable[[], torch.Tensor]  # returns the scalar to differentiate
 
 
 def whole_step(encoder: nn.Module, decoder: nn.Module, states: torch.Tensor, spec: VariationalSpec) -> Work:
-    """The loss of a training step on states (B, T, N, 2P)."""
+    """Return a function that computes the loss of a training step on states (B, T, N, 2P)."""
     generator, (b, t, n, d) = torch.Generator().manual_seed(0), states.shape
 
     def loss() -> torch.Tensor:
@@ -47,7 +47,7 @@ def whole_step(encoder: nn.Module, decoder: nn.Module, states: torch.Tensor, spe
 
 
 def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, spec: VariationalSpec) -> Work:
-    """The edges' embeddings and the decoder under a given graph: no LSTM, no heads, no loss."""
+    """Return a function that computes edge embeddings and the decoder under a given graph: no LSTM, heads or loss."""
     b, t, n, _ = states.shape
     graph = torch.softmax(torch.randn(b, t, n, n, spec.edge_types), dim=-1)
 
@@ -59,7 +59,7 @@ def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, sp
 
 
 def works_of(name: str) -> dict[str, Work]:
-    """What is timed, by name."""
+    """Return the functions to time, by name."""
     (b, t, n, p), hidden, memory, decoder_name = CASES[name]
     spec = required(build_spec("dnri", "yjunction", "quick").variational).model_copy(
         update={"hidden": hidden, "memory": memory, "decoder": decoder_name, "decoder_hidden": hidden}
@@ -73,8 +73,9 @@ def works_of(name: str) -> dict[str, Work]:
 
 
 def median_seconds(work: Work) -> list[float]:
-    """Median CPU seconds of the fast and the readable form, forward and backward (the optimiser is left out), without a
-    warm-up round.
+    """Return median CPU seconds of the fast and the readable form, forward and backward, without the optimizer.
+
+    A first round warms up and does not count.
     """
     taken: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS + 1):
@@ -86,7 +87,7 @@ def median_seconds(work: Work) -> list[float]:
 
 
 def compare() -> None:
-    """Print two lines for each case: the whole training step, and its message passing alone."""
+    """Print two lines per case: the whole training step, and its message passing alone."""
     print(f"\n{'dnri, CPU seconds':<34}{'fast':>10}{'readable':>14}{'ratio':>8}")
     for name in CASES:
         for what, work in works_of(name).items():

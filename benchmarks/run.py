@@ -1,5 +1,6 @@
-"""`make bench`: how long the command line, an epoch of training (one thread), the store, dnri's message passing and a
-training step of dnri and nri take on this machine.
+"""`make bench`: time the command line, an epoch of training, the store, and the training steps of nri and dnri.
+
+Training uses one thread.
 """
 
 import statistics
@@ -20,7 +21,7 @@ from ssmail.training.loop import TrainingLoop
 
 
 def seconds(work: Callable[[], object], times: int) -> float:
-    """The median of a few runs."""
+    """Return the median wall-clock seconds of several calls."""
     taken = []
     for _ in range(times):
         begin = time.perf_counter()
@@ -30,21 +31,21 @@ def seconds(work: Callable[[], object], times: int) -> float:
 
 
 def help_text() -> float:
-    """`ssmail --help`, a new process."""
+    """Time `ssmail --help` in a new process."""
     return seconds(
         lambda: subprocess.run([sys.executable, "-m", "ssmail_cli", "--help"], capture_output=True, check=True), 7
     )
 
 
 def epoch() -> float:
-    """One epoch of the profile quick, its evaluations included; the first one is not counted."""
+    """Time an epoch of the profile quick, evaluation included. The first epoch does not count."""
     loop = TrainingLoop(build_spec("ssail", "yjunction", "quick"), seed=0)
     loop.run_epoch()
     return seconds(loop.run_epoch, 5)
 
 
 def stored_epoch() -> float:
-    """Writing the 25 metrics of an epoch into SQLite."""
+    """Time writing the 25 metrics of an epoch to SQLite."""
     with tempfile.TemporaryDirectory() as folder:
         store = Store.open(Path(folder) / "ssmail.db")
         writer = store.start_run(build_spec("ssail", "yjunction", "quick"), 0, dataset_hash=None, device="cpu")

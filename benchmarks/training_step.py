@@ -1,11 +1,11 @@
 """CPU seconds and peak memory of a training step of dnri and nri, in the fast form and in the readable one.
 
 A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The forms differ by
-`ssmail.models.message_passing.FAST` only; weights, inputs and random numbers are the same. Each measurement
-is a fresh process with one thread, so that its peak memory is its own; the forms take turns. The first step of each
-process warms it up and is not counted; the difference of its results between the forms is told. Whether the forms are
-equal is decided in double precision, at the same widths on windows of SHORT states: single precision is no judge, for
-there each form is as far from the truth as from the other.
+`ssmail.models.message_passing.FAST` only; weights, inputs and random numbers are the same. Each measurement runs in a
+new process with one thread, so that its peak memory is its own; the forms take turns. The first step of each process
+warms up and does not count, but its results are compared between the forms. Equality is checked in double precision, at
+the same widths on windows of SHORT states: in single precision, each form is as far from the exact result as from the
+other form.
 """
 
 import argparse
@@ -45,7 +45,7 @@ TOLERANCE = 1e-9  # of results relative to their largest value, in double precis
 
 
 def spec_of(method: str, size: str) -> RunSpec:
-    """The specification of the published models (reference numbers in docs/architecture.md), in one of SIZES."""
+    """Build the spec of the published models in one of SIZES (reference numbers in docs/architecture.md)."""
     names = ("hidden", "memory", "head", "decoder_hidden")
     sizes = [f"variational.{name}={value}" for name, value in zip(names, SIZES[size][2], strict=True)]
     fixed = ["edge_types=2", "first_type_is_none=true", "decoder=recurrent", "batch_norm=true", "temperature=0.5"]
@@ -54,7 +54,7 @@ def spec_of(method: str, size: str) -> RunSpec:
 
 
 def walkers(agents: int, steps: int) -> Batch:
-    """16 trajectories of agents that swing about, in scaled units: (16, steps, agents, 2 * 3)."""
+    """Make 16 trajectories of oscillating agents in scaled units: states (16, steps, agents, 2 * 3)."""
     draw = torch.Generator().manual_seed(0)
     phase, pace = torch.rand(16, 1, agents, 3, generator=draw), 0.1 + 0.2 * torch.rand(16, 1, 1, 1, generator=draw)
     positions = 0.8 * torch.sin(6.3 * phase + pace * torch.arange(steps + 1).view(1, -1, 1, 1))
@@ -65,7 +65,7 @@ def walkers(agents: int, steps: int) -> Batch:
 def make_learner(
     method: str, size: str, form: str, dtype: torch.dtype = torch.float32, states: int | None = None
 ) -> VariationalLearner:
-    """The same weights and trajectories, of `states` states if given, in each form."""
+    """Make a learner with the same weights and trajectories in each form; `states` overrides their length."""
     agents, steps = SIZES[size][0], states or SIZES[size][1]
     scaling = Scaling(position_min=-1.0, position_max=1.0, velocity_min=-1.0 / 3, velocity_max=1.0 / 3)
     experts = walkers(agents, steps)
@@ -86,12 +86,12 @@ def make_learner(
 
 
 def one_step(learner: VariationalLearner) -> dict[str, float]:
-    """A training step under complete teacher forcing; the metrics of the loss."""
+    """Train one step under complete teacher forcing and return the metrics of the loss."""
     return learner._update(torch.ones(learner.training.batch, learner.context.steps, dtype=torch.bool))
 
 
 def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
-    """Train a step: the loss and its terms, the outputs of encoder and decoder, and the gradients of all weights."""
+    """Train one step; return the loss and its terms, the outputs of encoder and decoder, and all gradients."""
     seen: dict[str, Tensor] = {}
 
     def keep(name: str, made: Tensor | tuple[Tensor | None, ...]) -> None:
@@ -109,8 +109,9 @@ def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
 
 
 def largest_difference(readable: dict[str, Tensor], fast: dict[str, Tensor]) -> tuple[float, float]:
-    """The largest absolute difference of any result but gradients, and the largest difference of any result relative
-    to the largest value of that result.
+    """Return the largest absolute difference, gradients aside, and the largest relative difference.
+
+    A difference is relative to the largest value of its result.
     """
     absolute = relative = 0.0
     for name, value in readable.items():
@@ -122,7 +123,7 @@ def largest_difference(readable: dict[str, Tensor], fast: dict[str, Tensor]) -> 
 
 
 def check_equal(method: str, size: str) -> None:
-    """Raises SystemExit when the forms differ by more than TOLERANCE in double precision; else says by how much."""
+    """Print how far the forms differ in double precision. Raises SystemExit if it is more than TOLERANCE."""
     made = (first_results(make_learner(method, size, form, torch.float64, SHORT)) for form in FORMS)
     _, relative = largest_difference(*made)
     if not relative <= TOLERANCE:
@@ -133,7 +134,7 @@ def check_equal(method: str, size: str) -> None:
 
 
 def measure(method: str, size: str, form: str, steps: int, results: str) -> dict[str, object]:
-    """What a process of its own does. Seconds of each step after the first; the peak of resident memory in MB."""
+    """Measure in this process: the seconds of each step after the first, and the peak resident memory in MB."""
     torch.set_num_threads(1)
     learner, seconds = make_learner(method, size, form), []
     torch.save(first_results(learner), results)
@@ -145,7 +146,7 @@ def measure(method: str, size: str, form: str, steps: int, results: str) -> dict
 
 
 def compare_steps(method: str, size: str, rounds: int, steps: int) -> None:
-    """Print a line for each form, and how far apart their results are. Raises SystemExit as check_equal does."""
+    """Print a line per form, and how far their results differ. Raises SystemExit like `check_equal`."""
     with tempfile.TemporaryDirectory() as folder:
         seconds: dict[str, list[float]] = {form: [] for form in FORMS}
         peak = dict.fromkeys(FORMS, 0.0)
@@ -168,7 +169,7 @@ def compare_steps(method: str, size: str, rounds: int, steps: int) -> None:
 def report(
     sizes: Sequence[str], methods: Sequence[str] = tuple(BATCH), rounds: int = ROUNDS, steps: int = STEPS
 ) -> None:
-    """A table of all sizes and methods."""
+    """Print a table of all sizes and methods."""
     print(f"\n{'training step':<34}{'CPU s':>10}{'peak MB':>10}{'faster':>8}{'smaller':>8}")
     for size in sizes:
         for method in methods:
@@ -176,7 +177,7 @@ def report(
 
 
 def main(given: Sequence[str]) -> None:
-    """`--measure METHOD SIZE FORM STEPS FILE` is for this program's own processes."""
+    """Run the benchmark. `--measure METHOD SIZE FORM STEPS FILE` is for this program's own subprocesses."""
     if given[:1] == ["--measure"]:
         method, size, form, steps, results = given[1:]
         print(json.dumps(measure(method, size, form, int(steps), results)))

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ssmail.errors import InputError
-from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
+from ssmail.training.loop import load_checkpoint, save_checkpoint
 
 
 def some_state() -> dict[str, Any]:

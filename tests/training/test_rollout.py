@@ -12,7 +12,7 @@ from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
 from ssmail.models.features import Features
 from ssmail.models.policy import GraphPolicy
-from ssmail.training.rollout import Rollout, rollout
+from ssmail.training.rollout import PolicyPredictor, Rollout
 
 INTEGRATOR = Integrator(Scaling(-20.0, 45.0, -0.7, 1.1))
 B, H, N, D, A, STEPS = 2, 4, 3, 4, 2, 5
@@ -57,7 +57,9 @@ class Deaf:
 
 def deaf(noise: Tensor | None, features: Features = PLAIN, **options: Any) -> tuple[Deaf, Rollout]:
     policy: Any = Deaf()
-    return policy, rollout(policy, features, INTEGRATOR, OBSERVED, STEPS, torch.Generator(), noise=noise, **options)
+    return policy, PolicyPredictor(policy, features, INTEGRATOR).rollout(
+        OBSERVED, STEPS, torch.Generator(), noise=noise, **options
+    )
 
 
 def test_noise_reaches_what_is_read_and_not_where_the_group_is() -> None:
@@ -111,7 +113,7 @@ def acting(
     for p in policy.parameters():
         p.data += 0.3 * torch.randn_like(p)
     draw = torch.Generator().manual_seed(seed)
-    return policy, rollout(policy, PLAIN, INTEGRATOR, observed, STEPS, draw, noise=noise, **options)
+    return policy, PolicyPredictor(policy, PLAIN, INTEGRATOR).rollout(observed, STEPS, draw, noise=noise, **options)
 
 
 @pytest.mark.parametrize("noise", [None, NOISE], ids=["clean", "noisy"])

@@ -147,16 +147,13 @@ def rank_test(first: npt.ArrayLike, second: npt.ArrayLike) -> OneSided:
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if math.comb(len(a) + len(b), len(a)) <= MAX_SPLITS:
-        less, greater = (permutation_test(a, b, side, on="ranks").p for side in ("less", "greater"))
-        return OneSided(less, greater)
+        return OneSided(*(permutation_test(a, b, side, on="ranks").p for side in ("less", "greater")))
     from scipy.stats import mannwhitneyu
 
     ranks = midranks(np.concatenate([a, b]))
     x, y = ranks[: len(a)], ranks[len(a) :]
-    less, greater = (
-        float(mannwhitneyu(x, y, alternative=side, method="asymptotic").pvalue) for side in ("less", "greater")
-    )
-    return OneSided(less, greater)
+    found = (mannwhitneyu(x, y, alternative=side, method="asymptotic") for side in ("less", "greater"))
+    return OneSided(*(float(test.pvalue) for test in found))
 
 
 def shift(first: npt.ArrayLike, second: npt.ArrayLike) -> Estimate:

@@ -16,8 +16,7 @@ from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.planning import BEST, LAST, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
-from ssmail.training.loop import Divergence, TrainingLoop
+from ssmail.training.loop import Divergence, TrainingLoop, load_checkpoint, save_checkpoint
 
 
 class Loop(Protocol):

@@ -9,14 +9,12 @@ import torch
 from torch import Tensor
 
 from ssmail.config.sections import SacSpec
-from ssmail.envs.integrator import Integrator
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
 from ssmail.models.critic import TwinCritic
-from ssmail.models.features import Features
 from ssmail.models.graph_encoder import graph_entropy
-from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.optimization import clipped_step
+from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import Generators
 
 Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions as read (B, T, N, A) -> rewards (B, T, N)
@@ -43,23 +41,16 @@ class ActorCritic:
     """
 
     def __init__(
-        self,
-        spec: SacSpec,
-        policy: GraphPolicy,
-        critic: TwinCritic,
-        features: Features,
-        integrator: Integrator,
-        generators: Generators,
-        gradient_clip: float,
+        self, spec: SacSpec, actor: PolicyPredictor, critic: TwinCritic, generators: Generators, gradient_clip: float
     ) -> None:
         self.spec, self.gradient_clip = spec, gradient_clip
-        self.policy, self.critic = policy, critic
-        self.features, self.integrator, self.generators = features, integrator, generators
-        self.device = next(policy.parameters()).device
+        self.policy, self.critic = actor.model, critic
+        self.features, self.integrator, self.generators = actor.features, actor.integrator, generators
+        self.device = next(critic.parameters()).device
         self.target_critic = deepcopy(critic).requires_grad_(False)
         self.log_temperature = torch.tensor(max(spec.temperature, 1e-8), device=self.device).log().requires_grad_()
         self.optimizers: dict[str, torch.optim.Optimizer] = {
-            "actor": torch.optim.Adam(policy.parameters(), lr=spec.actor_learning_rate, fused=True),
+            "actor": torch.optim.Adam(self.policy.parameters(), lr=spec.actor_learning_rate, fused=True),
             "critic": torch.optim.Adam(critic.parameters(), lr=spec.critic_learning_rate, fused=True),
             "temperature": torch.optim.Adam([self.log_temperature], lr=spec.temperature_learning_rate, fused=True),
         }

@@ -26,15 +26,12 @@ from ssmail.losses.labels import checked_label
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
-from ssmail.models.features import Features
-from ssmail.models.normalization import ActionBounds
-from ssmail.models.policy import GraphPolicy
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext, Stateful
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
-from ssmail.training.rollout import PolicyPredictor, rollout
+from ssmail.training.rollout import PolicyPredictor
 
 
 @dataclass(frozen=True)
@@ -70,20 +67,14 @@ class AdversarialLearner:
         if self.supervision:
             self.label = checked_label(self.supervision, load_label(self.supervision.label))
         self.experts, self.generators, self.device = context.experts, context.generators, context.device
-        state_size, action_size = self.experts.states.shape[-1], self.experts.actions.shape[-1]
-        self.features = Features.of(model, self.experts.states)
-        inputs = self.features.size(state_size)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(inputs, action_size, model, ActionBounds.of(model, self.features.normalization)).to(
-                self.device
-            )
-            critic = TwinCritic(inputs + action_size, model).to(self.device)
-            self.discriminator = Discriminator(inputs + action_size, model.hidden).to(self.device)
-        self.actor_critic = ActorCritic(
-            sac, policy, critic, self.features, context.integrator, self.generators, self.training.gradient_clip
-        )
-        self.predictor = PolicyPredictor(policy, self.features, context.integrator)
+            self.predictor = PolicyPredictor.create(model, self.experts, context.integrator)
+            self.features = self.predictor.features
+            inputs = self.features.size(self.experts.states.shape[-1]) + self.experts.actions.shape[-1]
+            critic = TwinCritic(inputs, model).to(self.device)
+            self.discriminator = Discriminator(inputs, model.hidden).to(self.device)
+        self.actor_critic = ActorCritic(sac, self.predictor, critic, self.generators, self.training.gradient_clip)
         self.optimizer = torch.optim.Adam(
             self.discriminator.parameters(),
             lr=self.adversarial.learning_rate,
@@ -122,10 +113,7 @@ class AdversarialLearner:
         source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
         interventions = draw_interventions(count, steps, frequency, self.generators["curriculum"])
         expert = self.experts.states[source]
-        made = rollout(
-            self.actor_critic.policy,
-            self.features,
-            self.context.integrator,
+        made = self.predictor.rollout(
             expert[:, :1],
             steps,
             self.generators["policy"],
@@ -163,23 +151,17 @@ class AdversarialLearner:
         loss, terms = self.objective.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
         # wail bounds D's slope by a gradient penalty, or by clipping its weights.
         if self.wasserstein and self.wasserstein.constraint == "penalty":
-            terms["penalty"] = self.wasserstein.penalty * self._penalty(x, actions)
+            (x_g, x_e), (a_g, a_e) = x.chunk(2), actions.chunk(2)
+            weight = torch.rand(x_g.shape[:2], generator=self.generators["data"]).to(self.device)
+            penalty = gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
+            terms["penalty"] = self.wasserstein.penalty * penalty
             loss = loss + terms["penalty"]
         clipped_step(self.optimizer, loss, self.discriminator.parameters(), self.training.gradient_clip)
         if self.wasserstein and self.wasserstein.constraint == "clipping":
-            self._clip_weights(self.wasserstein.clip)
+            with torch.no_grad():
+                for parameter in self.discriminator.parameters():
+                    parameter.clamp_(-self.wasserstein.clip, self.wasserstein.clip)
         return {f"discriminator/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
-
-    def _penalty(self, x: Tensor, actions: Tensor) -> Tensor:
-        """Return the gradient penalty between the generated and the expert half of a batch."""
-        (x_g, x_e), (a_g, a_e) = x.chunk(2), actions.chunk(2)
-        weight = torch.rand(x_g.shape[:2], generator=self.generators["data"]).to(self.device)
-        return gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
-
-    @torch.no_grad()
-    def _clip_weights(self, limit: float) -> None:
-        for parameter in self.discriminator.parameters():
-            parameter.clamp_(-limit, limit)
 
     def _actor_batch(self) -> Batch:
         """Draw the actor-critic's batch from the replay buffer.

@@ -10,6 +10,9 @@ from torch import Tensor
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Trajectories
 
+Arrays = dict[str, np.ndarray]
+"""Arrays to store with a run, by name."""
+
 
 @dataclass(frozen=True)
 class Batch:

@@ -1,44 +1,56 @@
-"""Behavioral cloning (bc, section 2): the policy of the adversarial methods, fitted to the expert's actions."""
+"""Supervised learning from expert trajectories; behavioral cloning (bc, section 2)."""
 
 from collections.abc import Mapping
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from ssmail.config.sections import required
-from ssmail.models.features import Features
-from ssmail.models.normalization import ActionBounds
-from ssmail.models.policy import GraphPolicy
 from ssmail.training.learner import LearnerContext, Stateful
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
 from ssmail.training.rollout import PolicyPredictor
 
 
-class CloningLearner:
-    """Maximum likelihood on batches of whole expert trajectories. It generates nothing, so no curriculum applies."""
+class SupervisedLearner:
+    """The part that bc, nri and dnri share: one network, Adam, and a learning-rate schedule.
 
-    def __init__(self, context: LearnerContext) -> None:
-        spec = context.spec
-        model = required(spec.model)
-        self.context, self.cloning, self.training = context, required(spec.cloning), required(spec.training)
-        self.generators, self.device = context.generators, context.device
-        state_size, action_size = context.experts.states.shape[-1], context.experts.actions.shape[-1]
-        features = Features.of(model, context.experts.states)
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.generators.seeds["weights"])
-            policy = GraphPolicy(
-                features.size(state_size), action_size, model, ActionBounds.of(model, features.normalization)
-            )
-        self.policy = policy.to(self.device)
-        self.predictor = PolicyPredictor(self.policy, features, context.integrator)
-        self.optimizer = torch.optim.Adam(self.policy.parameters(), lr=self.cloning.learning_rate, fused=True)
+    `name` is the network's name in checkpoints.
+    """
+
+    def __init__(self, context: LearnerContext, name: str, network: nn.Module) -> None:
+        self.context, self.generators, self.device = context, context.generators, context.device
+        self.cloning, self.training = required(context.spec.cloning), required(context.spec.training)
+        self.name, self.network = name, network
+        self.optimizer = torch.optim.Adam(network.parameters(), lr=self.cloning.learning_rate, fused=True)
         self.schedule = LearningRateSchedule(
-            self.training, {"policy": self.optimizer}, {"policy": self.cloning.learning_rate_final}
+            self.training, {name: self.optimizer}, {name: self.cloning.learning_rate_final}
         )
 
     def networks(self) -> list[nn.Module]:
-        """Return the policy."""
-        return [self.policy]
+        """Return the network."""
+        return [self.network]
+
+    def step(self, loss: Tensor) -> None:
+        """Take one optimizer step on `loss`."""
+        clipped_step(self.optimizer, loss, self.network.parameters(), self.training.gradient_clip)
+
+    def parts(self) -> Mapping[str, Stateful]:
+        """Return network and optimizer."""
+        return {self.name: self.network, "optimizer": self.optimizer}
+
+
+class CloningLearner(SupervisedLearner):
+    """Fits the policy of the adversarial methods to the expert's actions by maximum likelihood.
+
+    It generates nothing, so no curriculum applies.
+    """
+
+    def __init__(self, context: LearnerContext) -> None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(context.generators.seeds["weights"])
+            self.predictor = PolicyPredictor.create(required(context.spec.model), context.experts, context.integrator)
+        self.policy = self.predictor.model
+        super().__init__(context, "policy", self.policy)
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Take training.updates gradient steps."""
@@ -54,9 +66,5 @@ class CloningLearner:
         graphs, _, _ = self.policy.graphs(x, graph_noise)
         velocity = read[..., self.policy.action_size :]
         loss = -self.policy.actor.log_prob(x, graphs, velocity, batch.actions).mean()
-        clipped_step(self.optimizer, loss, self.policy.parameters(), self.training.gradient_clip)
+        self.step(loss)
         return {"cloning/loss": float(loss.detach())}
-
-    def parts(self) -> Mapping[str, Stateful]:
-        """Return policy and optimizer."""
-        return {"policy": self.policy, "optimizer": self.optimizer}

@@ -1,4 +1,4 @@
-"""Curricula: how often generation is put back on the expert's track (section 3.3)."""
+"""Curricula: how often a rollout is put back on the expert's track (section 3.3)."""
 
 import torch
 from torch import Tensor
@@ -7,10 +7,10 @@ from ssmail.config.sections import CurriculumSpec
 
 
 def intervention_frequency(spec: CurriculumSpec, epoch: int, epochs: int) -> float:
-    """Probability of an intervention at each step of epoch 0 .. epochs - 1.
+    """Return the probability of an intervention at each step of epoch 0 .. epochs - 1.
 
-    none: 0. teacher-forcing: `rate`, the same in every epoch. trajectory-forcing and scheduled-sampling: see
-    `trajectory_forcing` and `scheduled_sampling`, with x = epoch / epochs.
+    none: 0. teacher-forcing: `rate` in every epoch. trajectory-forcing and scheduled-sampling: the functions
+    `trajectory_forcing` and `scheduled_sampling` of x = epoch / epochs.
     """
     x = epoch / epochs
     if spec.name == "trajectory-forcing":
@@ -21,9 +21,9 @@ def intervention_frequency(spec: CurriculumSpec, epoch: int, epochs: int) -> flo
 
 
 def trajectory_forcing(x: float, beta: float) -> float:
-    """f = 1.5 ** (-x / beta) at the fraction x of training (section 3.3).
+    """Return f = 1.5 ** (-x / beta) at the fraction x of training (section 3.3).
 
-    The edges are those of section 4.5: beta 0 never intervenes, beta 1 always does (complete teacher forcing).
+    The limits are those of section 4.5: beta 0 never intervenes, beta 1 always does (complete teacher forcing).
     """
     if beta == 0:
         return 0.0
@@ -33,11 +33,10 @@ def trajectory_forcing(x: float, beta: float) -> float:
 
 
 def scheduled_sampling(x: float, decay: str, half_life: float, steepness: float) -> float:
-    """The decays of Bengio et al. (2015), section 2.4, each scaled to reach 1/2 at the fraction x = `half_life` of
-    training.
+    """Return a decay of Bengio et al. (2015), section 2.4, scaled to reach 1/2 at the fraction x = `half_life` = h.
 
-    linear: max(0, 1 - x / (2 h)). exponential: 2 ** (-x / h). inverse-sigmoid: k / (k + k ** (x / h)), which begins at
-    k / (k + 1).
+    linear: max(0, 1 - x / (2 h)). exponential: 2 ** (-x / h). inverse-sigmoid: k / (k + k ** (x / h)), which starts at
+    k / (k + 1); k is `steepness`.
     """
     if decay == "linear":
         return max(0.0, 1 - x / (2 * half_life))
@@ -47,36 +46,28 @@ def scheduled_sampling(x: float, decay: str, half_life: float, steepness: float)
 
 
 def draw_interventions(batch: int, steps: int, frequency: float, generator: torch.Generator) -> Tensor:
-    """(B, T) booleans: at which steps the whole group is put on the expert's state. Step 0 is the start and never
-    counts.
-    """
+    """Draw the steps at which the whole group is moved to the expert's state: (B, T) booleans, False at step 0."""
     mask = torch.rand(batch, steps, generator=generator) < frequency
     mask[:, 0] = False
     return mask
 
 
 def mean_segment_length(interventions: Tensor) -> float:
-    """Mean number of generated steps between two interventions (or the trajectory's ends), from a (B, T) mask of
-    interventions.
+    """Return the mean number of steps between interventions or trajectory ends, from a mask (B, T).
 
-    A trajectory of T steps with k interventions after its start has k + 1 segments, so the mean over a batch is B * T /
-    (B + interventions).
+    A trajectory with k interventions has k + 1 segments, so the mean over a batch is B * T / (B + interventions).
     """
     b, t = interventions.shape
     return b * t / (b + int(interventions.sum()))
 
 
 def expected_segment_length(frequency: float, steps: int) -> float:
-    """What `mean_segment_length` tends to in large batches: T / (1 + (T - 1) f), for T steps of which all but the
-    first may be interventions.
-    """
+    """Return the limit of `mean_segment_length` in large batches: T / (1 + (T - 1) f), as step 0 never counts."""
     return steps / (1 + (steps - 1) * frequency)
 
 
 def curriculum_metrics(frequency: float, interventions: list[Tensor]) -> dict[str, float]:
-    """What is stored of an epoch's curriculum: the frequency, and the mean segment length over its masks (B, T), as
-    measured and as expected.
-    """
+    """Return an epoch's metrics: the frequency, and the mean segment length of its masks (B, T) and its expectation."""
     return {
         "curriculum/intervention_frequency": frequency,
         "curriculum/segment_length": sum(map(mean_segment_length, interventions)) / len(interventions),

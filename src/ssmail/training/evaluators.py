@@ -3,6 +3,7 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -12,22 +13,17 @@ from ssmail.config.sections import required
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
-from ssmail.evaluation.metrics import (
-    forecast_metrics,
-    lane_metrics,
-    lane_test_metrics,
-    letter_metrics,
-    one_step_mse,
-)
+from ssmail.evaluation.metrics import forecast_metrics, lane_metrics, lane_test_metrics, letter_metrics, one_step_mse
 from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
-from ssmail.training.batches import Batch, to_numpy
+from ssmail.training.batches import Arrays, Batch, to_numpy
 from ssmail.training.learner import LearnerContext, Predictor
-
-Arrays = dict[str, np.ndarray]
 
 
 class Evaluator(ABC):
     """Measures predictors on the splits of an expert set. It draws from the evaluation generator only."""
+
+    selected_by: ClassVar[str]
+    """The metric of an epoch that selects the best model: the smaller, the better."""
 
     def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
         self.context, self.data, self.spec = context, data, context.spec.evaluation
@@ -40,9 +36,10 @@ class Evaluator(ABC):
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """Return the metrics of an epoch, on the validation split and on some training trajectories."""
 
-    @abstractmethod
     def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
         """Return (flawed, error) of the epoch with these metrics. The epoch with the smallest pair is the best."""
+        error = values[self.selected_by]
+        return not math.isfinite(error), error
 
     @abstractmethod
     def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
@@ -87,6 +84,8 @@ class Evaluator(ABC):
 class LaneEvaluator(Evaluator):
     """Y-Junction: rollouts from the first state, measured by the distance to the nearer lane."""
 
+    selected_by = "validation/mode_mse"
+
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """Roll out once from every validation start and from some training starts."""
         chosen = self.draw_training()
@@ -101,12 +100,12 @@ class LaneEvaluator(Evaluator):
         }
 
     def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
-        """Rank by validation mode_mse, and epochs that use every mode before all others.
+        """Rank epochs that use every mode before all others.
 
         mode_mse is the distance to the nearest mode; by itself it would favor a model that has dropped one.
         """
-        error, balance = values["validation/mode_mse"], values["validation/lane_balance"]
-        return balance < self.spec.least_balance or not math.isfinite(error), error
+        flawed, error = super().rank(values)
+        return flawed or values["validation/lane_balance"] < self.spec.least_balance, error
 
     def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
         """Evaluate the best model, sampled and by its mean actions, the last model, and constant velocity."""
@@ -136,6 +135,8 @@ class LaneEvaluator(Evaluator):
 class LetterEvaluator(Evaluator):
     """Letters: rollouts from the first state, measured by the distance to each agent's letter."""
 
+    # The mse also depends on the tempo, and prefers a vague letter in time to a clear one that comes late.
+    selected_by = "validation/stroke_distance"
     UNTRAINED_STARTS = 16  # test starts from which the untrained model is rolled out
 
     def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
@@ -151,14 +152,6 @@ class LetterEvaluator(Evaluator):
             **_prefixed("validation", self._measure(made[:, :count], truth[:count])),
             **_prefixed("train", self._measure(made[:, count:], truth[count:])),
         }
-
-    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
-        """Rank by validation stroke_distance, the measure of the letters.
-
-        The mse also depends on the tempo, and prefers a vague letter in time to a clear one that comes late.
-        """
-        error = values["validation/stroke_distance"]
-        return not math.isfinite(error), error
 
     def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
         """Evaluate the best model, sampled and by its mean actions, the last model, constant velocity, and the expert.
@@ -211,6 +204,7 @@ class ForecastEvaluator(Evaluator):
     Section 4.6; the windows follow DNRI's protocol. Raises InputError if the test windows are too short.
     """
 
+    selected_by = "validation/mse"
     KEPT_WINDOWS = 4  # test windows whose predictions are stored
 
     def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
@@ -227,11 +221,6 @@ class ForecastEvaluator(Evaluator):
             measured, _ = forecast_metrics(to_numpy(predicted[None, :, 1:]), to_numpy(truth[:, 1:]), self.scaling)
             values |= _prefixed(split, measured)
         return values
-
-    def rank(self, values: Mapping[str, float]) -> tuple[bool, float]:
-        """Rank by validation mse over all predicted steps."""
-        error = values["validation/mse"]
-        return not math.isfinite(error), error
 
     def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
         """Evaluate the best model, clean and noisy, sampled and by its mean; the last model; the baselines."""

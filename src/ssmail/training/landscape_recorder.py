@@ -15,7 +15,7 @@ from ssmail.evaluation.landscape import Plane, closeness, mean_cosine, nearest_p
 from ssmail.losses.self_supervision import mix, nearest
 from ssmail.models.features import Features
 from ssmail.training.adversarial import AdversarialLearner
-from ssmail.training.batches import to_numpy
+from ssmail.training.batches import Arrays, to_numpy
 from ssmail.training.learner import Learner, LearnerContext
 
 REFERENCES = 2  # training trajectories that supply everything but the agent's position at a point of the plane
@@ -25,8 +25,6 @@ ROLLOUTS = 8  # current trajectories, from training starts
 CURRENT = 0.5  # the fraction of all epochs after which the policy is "the current one" of Figure 2
 ALPHAS_BEHIND = tuple(-a / 8 for a in range(8, 0, -1))  # of points behind the current trajectory
 ALPHAS_AHEAD = tuple(a / 8 for a in range(8))  # of points on the current trajectory and ahead of it
-
-Arrays = dict[str, np.ndarray]
 
 
 def landscape_epochs(spec: RunSpec) -> tuple[int, ...]:
@@ -138,8 +136,8 @@ class LandscapeRecorder:
             states = here[0].clone()
             states[..., agent, :2] = points.unsqueeze(2)
             reward, gradient = position_gradient(self.learner, RewardInputs(states, *here[1:]), agent)
-            rewards.append((weights * _double(reward)).sum(dim=2))
-            gradients.append((weights.unsqueeze(-1) * _double(gradient)).sum(dim=2))
+            rewards.append((weights * reward.double().cpu()).sum(dim=2))
+            gradients.append((weights.unsqueeze(-1) * gradient.double().cpu()).sum(dim=2))
         return torch.stack(rewards).numpy(), torch.stack(gradients).numpy()
 
     def rollouts(self) -> Tensor:
@@ -190,19 +188,13 @@ class LandscapeRecorder:
 
     def _raw(self, states: Tensor) -> np.ndarray:
         """Return raw positions (..., 2) of scaled states."""
-        raw: np.ndarray = self.context.integrator.scaling.unscale_positions(to_numpy(states[..., :2])).astype(
-            np.float32
-        )
-        return raw
+        raw: np.ndarray = self.context.integrator.scaling.unscale_positions(to_numpy(states[..., :2]))
+        return raw.astype(np.float32)
 
 
 def _spread(length: int, count: int) -> np.ndarray:
     """Return up to `count` indices, evenly spaced from 0 to length - 1."""
     return np.linspace(0, length - 1, min(count, length)).round().astype(int)
-
-
-def _double(tensor: Tensor) -> Tensor:
-    return tensor.double().cpu()
 
 
 def _half(values: np.ndarray) -> np.ndarray:

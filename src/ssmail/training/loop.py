@@ -1,26 +1,27 @@
-"""The training loop: epochs of training and validation, the best model, landscapes, and the state to resume from.
+"""The training loop: epochs of training and validation, the best model, landscapes, and checkpoints.
 
-It returns metrics and does not know where they are stored.
+The loop returns metrics and does not know where they are stored.
 """
 
 import math
 import time
+import zipfile
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
+from ssmail.data.atomic_file import atomic_write
 from ssmail.data.expert_sets import generate, load
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
-from ssmail.errors import SsmailError
+from ssmail.errors import InputError, SsmailError
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
-from ssmail.training.batches import Batch
+from ssmail.training.batches import Arrays, Batch
 from ssmail.training.cloning import CloningLearner
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
@@ -78,7 +79,7 @@ class TrainingLoop:
         self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
         self.untrained = deepcopy(self.learner.predictor)
         self.landscapes = LandscapeRecorder.for_learner(context, self.learner)
-        self.snapshot: dict[str, np.ndarray] = {}
+        self.snapshot: Arrays = {}
         self._record_landscape()
 
     def run_epoch(self) -> dict[str, float]:
@@ -113,7 +114,7 @@ class TrainingLoop:
             self.best_flawed, self.best_error, self.best_epoch = flawed, error, self.epoch
             self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
 
-    def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+    def final_evaluation(self) -> tuple[dict[str, float], Arrays]:
         """Return the metrics of the best and the last model on the test split, and the arrays to draw."""
         best = deepcopy(self.learner.predictor)
         best.model.load_state_dict(self.best_weights)
@@ -152,3 +153,37 @@ class TrainingLoop:
         for network in self.learner.networks():
             if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
                 raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write `state` (nested dicts and lists of tensors and plain data) to `path` and create its folder.
+
+    The write is atomic: after a crash or a power cut the file is either the old one or the new one. Raises InputError
+    if the file cannot be written.
+    """
+    try:
+        with atomic_write(path) as partial, partial.open("wb") as file:
+            torch.save(state, file)
+    except OSError as error:
+        raise InputError(
+            f"cannot write the checkpoint {path} ({error.strerror}); free or choose another place"
+        ) from error
+
+
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Return the state that `save_checkpoint` wrote, on the CPU, without running any code that the file holds.
+
+    Raises InputError if the file is missing or damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:  # torch does not verify the checksums that it writes
+            if archive.testzip() is not None:
+                raise zipfile.BadZipFile("wrong checksum")
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # damaged bytes can make the unpickler raise anything
+        raise InputError(
+            f"the checkpoint {path} cannot be read ({type(error).__name__}); start afresh with --resume never"
+        ) from error
+    if not isinstance(state, dict):
+        raise InputError(f"{path} is not a checkpoint of ssmail; start afresh with --resume never")
+    return state

@@ -1,14 +1,17 @@
-"""Rollouts of a graph policy in the trajectory environment, and the policy as a Predictor."""
+"""Rollouts of a graph policy in the trajectory environment."""
 
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ssmail.config.sections import ModelSpec
 from ssmail.envs.integrator import Integrator
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import Memory
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
+from ssmail.training.batches import Batch
 
 ENCODER_CHUNK = 10  # observed steps read at once; on recorded motion the edges of all steps together take gigabytes
 
@@ -25,67 +28,76 @@ class Rollout:
     actions: Tensor
 
 
-@torch.no_grad()
-def rollout(
-    policy: GraphPolicy,
-    features: Features,
-    integrator: Integrator,
-    observed: Tensor,
-    steps: int,
-    generator: torch.Generator,
-    *,
-    expert: Tensor | None = None,
-    interventions: Tensor | None = None,
-    deterministic: bool = False,
-    noise: Tensor | None = None,
-) -> Rollout:
-    """Roll the policy out for `steps` actions from the last of the `observed` states (B, H, N, D).
-
-    The graph encoder reads the earlier observed states first. At steps where `interventions` (B, T) is set, the group
-    is moved to the state of `expert` (B, T, N, D) before it acts. `deterministic` takes the mean action; the graph is
-    sampled in any case. `noise` (B, H + T - 1, N, D) is added to every state that the policy reads; the environment's
-    state stays clean.
-    """
-    b, h, n, _ = observed.shape
-    # Draw all noise up front.
-    graph_noise = policy.draw_graph_noise(b, steps, n, generator).to(observed.device)
-    action_noise = torch.randn(steps, b, 1, n, policy.action_size, generator=generator).to(observed.device)
-    if deterministic:
-        action_noise = torch.zeros_like(action_noise)
-    if noise is None:
-        noise = observed.new_zeros(1, h + steps - 1, 1, 1)
-    start = observed[:, 0] + noise[:, 0]
-    # Warm up the encoder's memory on the observed history.
-    memory: Memory | None = None
-    for first in range(0, h - 1, ENCODER_CHUNK):
-        part = slice(first, min(first + ENCODER_CHUNK, h - 1))
-        _, memory = policy.encoder(features(observed[:, part] + noise[:, part], start, first), memory)
-    state = observed[:, -1:]
-    states, actions = [], []
-    for t in range(steps):
-        # Curriculum: put the group back on the expert's track.
-        if interventions is not None and expert is not None:
-            state = torch.where(interventions[:, t].view(b, 1, 1, 1), expert[:, t : t + 1], state)
-        # Policy: read the state, infer the graph, act.
-        read = state + noise[:, h - 1 + t : h + t]
-        x = features(read, start, h - 1 + t)
-        at = t if graph_noise.shape[1] > 1 else 0
-        graph, _, memory = policy.graphs(x, graph_noise[:, at : at + 1], memory)
-        action = policy.actor.sample(x, graph, read[..., policy.action_size :], action_noise[t])
-        states.append(state)
-        actions.append(action)
-        # Environment.
-        state = integrator.step(state, action)
-    return Rollout(torch.cat([*states, state], dim=1), torch.cat(actions, dim=1))
-
-
 @dataclass(frozen=True)
 class PolicyPredictor:
-    """The Predictor of a graph policy. It samples the graphs in every case."""
+    """A graph policy in its environment: rollouts for training, and the Predictor interface for evaluation.
+
+    The graphs are sampled in every case.
+    """
 
     model: GraphPolicy
     features: Features
     integrator: Integrator
+
+    @classmethod
+    def create(cls, spec: ModelSpec, experts: Batch, integrator: Integrator) -> "PolicyPredictor":
+        """Make a policy with initial weights from torch's global generator, sized and normalized for `experts`."""
+        features = Features.of(spec, experts.states)
+        bounds = ActionBounds.of(spec, features.normalization)
+        size, action_size = features.size(experts.states.shape[-1]), experts.actions.shape[-1]
+        policy = GraphPolicy(size, action_size, spec, bounds).to(experts.states.device)
+        return cls(policy, features, integrator)
+
+    @torch.no_grad()
+    def rollout(
+        self,
+        observed: Tensor,
+        steps: int,
+        generator: torch.Generator,
+        *,
+        expert: Tensor | None = None,
+        interventions: Tensor | None = None,
+        deterministic: bool = False,
+        noise: Tensor | None = None,
+    ) -> Rollout:
+        """Roll the policy out for `steps` actions from the last of the `observed` states (B, H, N, D).
+
+        The graph encoder reads the earlier observed states first. At steps where `interventions` (B, T) is set, the
+        group is moved to the state of `expert` (B, T, N, D) before it acts. `deterministic` takes the mean action; the
+        graph is sampled in any case. `noise` (B, H + T - 1, N, D) is added to every state that the policy reads; the
+        environment's state stays clean.
+        """
+        policy, (b, h, n, _) = self.model, observed.shape
+        # Draw all noise up front.
+        graph_noise = policy.draw_graph_noise(b, steps, n, generator).to(observed.device)
+        action_noise = torch.randn(steps, b, 1, n, policy.action_size, generator=generator).to(observed.device)
+        if deterministic:
+            action_noise = torch.zeros_like(action_noise)
+        if noise is None:
+            noise = observed.new_zeros(1, h + steps - 1, 1, 1)
+        start = observed[:, 0] + noise[:, 0]
+        # Warm up the encoder's memory on the observed history.
+        memory: Memory | None = None
+        for first in range(0, h - 1, ENCODER_CHUNK):
+            part = slice(first, min(first + ENCODER_CHUNK, h - 1))
+            _, memory = policy.encoder(self.features(observed[:, part] + noise[:, part], start, first), memory)
+        state = observed[:, -1:]
+        states, actions = [], []
+        for t in range(steps):
+            # Curriculum: put the group back on the expert's track.
+            if interventions is not None and expert is not None:
+                state = torch.where(interventions[:, t].view(b, 1, 1, 1), expert[:, t : t + 1], state)
+            # Policy: read the state, infer the graph, act.
+            read = state + noise[:, h - 1 + t : h + t]
+            x = self.features(read, start, h - 1 + t)
+            at = t if graph_noise.shape[1] > 1 else 0
+            graph, _, memory = policy.graphs(x, graph_noise[:, at : at + 1], memory)
+            action = policy.actor.sample(x, graph, read[..., policy.action_size :], action_noise[t])
+            states.append(state)
+            actions.append(action)
+            # Environment.
+            state = self.integrator.step(state, action)
+        return Rollout(torch.cat([*states, state], dim=1), torch.cat(actions, dim=1))
 
     def free_run(
         self,
@@ -97,10 +109,7 @@ class PolicyPredictor:
         noise: Tensor | None = None,
     ) -> Tensor:
         """See Predictor."""
-        policy, features, integrator = self.model, self.features, self.integrator
-        return rollout(
-            policy, features, integrator, observed, steps, generator, deterministic=deterministic, noise=noise
-        ).states
+        return self.rollout(observed, steps, generator, deterministic=deterministic, noise=noise).states
 
     @torch.no_grad()
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:

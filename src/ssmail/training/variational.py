@@ -3,7 +3,7 @@
 Kipf et al. 2018 (nri); Graber and Schwing 2020 (dnri).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -18,9 +18,10 @@ from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from ssmail.training.cloning import SupervisedLearner
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
-from ssmail.training.learner import LearnerContext, Stateful
-from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
+from ssmail.training.learner import LearnerContext
+from ssmail.training.optimization import add_noise, mean_metrics
 
 PREDICTION_CHUNK = 16  # trajectories predicted at once
 
@@ -173,7 +174,7 @@ class VariationalPredictor:
         return self.integrator.step(now, self.model.decode(now, graphs)[0])
 
 
-class VariationalLearner:
+class VariationalLearner(SupervisedLearner):
     """Minimizes the negative evidence lower bound on batches of whole expert trajectories.
 
     The decoder reads the expert's state where the curriculum intervenes (always, by default: teacher forcing), and its
@@ -182,24 +183,15 @@ class VariationalLearner:
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
-        self.context, self.variational, self.cloning = context, required(spec.variational), required(spec.cloning)
-        self.curriculum, self.training = required(spec.curriculum), required(spec.training)
-        self.generators, self.device = context.generators, context.device
+        self.variational, self.curriculum = required(spec.variational), required(spec.curriculum)
         features = Features.of(self.variational, context.experts.states)
         state_size = context.experts.states.shape[-1]
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(self.generators.seeds["weights"])
+            torch.manual_seed(context.generators.seeds["weights"])
             model = VariationalModel(features, state_size, self.variational, dynamic=spec.method == "dnri")
-        self.model = model.to(self.device)
+        self.model = model.to(context.device)
         self.predictor = VariationalPredictor(self.model, context.integrator)
-        self.optimizer = torch.optim.Adam(self.model.parameters(), lr=self.cloning.learning_rate, fused=True)
-        self.schedule = LearningRateSchedule(
-            self.training, {"model": self.optimizer}, {"model": self.cloning.learning_rate_final}
-        )
-
-    def networks(self) -> list[nn.Module]:
-        """Return the model."""
-        return [self.model]
+        super().__init__(context, "model", self.model)
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Take training.updates gradient steps under the curriculum."""
@@ -229,7 +221,7 @@ class VariationalLearner:
             variance=self.variational.variance,
             kl_weight=self.variational.kl_weight,
         )
-        clipped_step(self.optimizer, loss, self.model.parameters(), self.training.gradient_clip)
+        self.step(loss)
         return {f"cloning/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
 
     def _decode(self, states: Tensor, graphs: Tensor, interventions: Tensor) -> Tensor:
@@ -248,7 +240,3 @@ class VariationalLearner:
             action, memory = decode(given, graphs[:, t : t + 1], memory)
             predicted.append(integrator.step(given, action))
         return torch.cat(predicted, dim=1)
-
-    def parts(self) -> Mapping[str, Stateful]:
-        """Return model and optimizer."""
-        return {"model": self.model, "optimizer": self.optimizer}
