@@ -64,7 +64,9 @@ FigureProfile = Annotated[
 ]
 State = Annotated[
     str | None,
-    typer.Option("--state", help="Only runs in this state: running, finished, failed, diverged or interrupted."),
+    typer.Option(
+        "--state", help="Only runs in this state: queued, running, finished, failed, diverged or interrupted."
+    ),
 ]
 Figure = Annotated[str | None, typer.Option("--figure", help="Only runs that this figure of the paper needs: fig5.")]
 
