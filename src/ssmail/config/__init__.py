@@ -1,1 +1,1 @@
-"""What a run is: specs, their sections and keys, and experiments.yaml, which they are built from."""
+"""Configuration: the spec of a run, its sections and keys, and experiments.yaml, which specs are built from."""

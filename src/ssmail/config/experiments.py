@@ -5,6 +5,7 @@
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
 from ssmail.config.spec import (
     ENVIRONMENTS,
-    GENERATED,
+    GENERATED_ENVIRONMENTS,
     METHODS,
     OPTIONAL_SECTIONS,
     RunSpec,
@@ -91,11 +92,23 @@ def ablation_specs(
     does (the source of a wrong value is --values or the file), and for an override of the ablation's key.
     """
     experiments = load_experiments(file)
-    return _ablation_specs(experiments, _read_ablation(experiments, name, environment), profile, values, overrides)
+    _, method, environment, key, own_values = _read_ablation(experiments, name, environment)
+    layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
+    layers += experiments.layers(ABLATION_LAYERS, ablation=name, profile=profile)
+    override_layers = _override_layers(overrides, method, environment, "--set")
+    if any(key in flatten(layer.values) for layer in override_layers):
+        raise InputError(f"{key} is what the ablation {name} varies; give its values with --values, not --set.")
+    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
+    specs: dict[Any, RunSpec] = {}
+    for value in own_values if values is None else values:
+        varied = Layer(source, _nested(key, value))
+        spec = _merge_layers(experiments, [*layers, *override_layers, varied], method, environment, profile)
+        specs[attrgetter(key)(spec)] = spec
+    return specs
 
 
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
-    """The runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
+    """Return the runs that figure `name` ("fig4") draws. Raises InputError for an unknown figure or a wrong entry."""
     experiments = load_experiments(file)
     entry = experiments.entry("figure", name)
     source = f"figures.{name} of {experiments.path.name}"
@@ -105,14 +118,6 @@ def figure_requirements(name: str, file: Path | None = None) -> FigureRequiremen
         return FigureRequirements(entry["environment"], tuple(entry["methods"]))
     needed = _read_ablation(experiments, entry["ablation"], entry["environment"])
     return FigureRequirements(needed.environment, (needed.method,), needed.name)
-
-
-def spec_value(spec: RunSpec, key: str) -> Any:
-    """Return the value of a dotted key of the spec."""
-    value: Any = spec
-    for part in key.split("."):
-        value = getattr(value, part)
-    return value
 
 
 def to_tuples(value: Any) -> Any:
@@ -140,7 +145,7 @@ def _merge_layers(
         merged = merge(merged, layer.values)
     if method in METHODS and environment in ENVIRONMENTS:
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(required_sections(method, environment)))
-        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED) - {environment})}
+        merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED_ENVIRONMENTS) - {environment})}
     label = flatten(merged).get(_LABEL)
     if isinstance(label, str):
         merged = merge(merged, _nested(_LABEL, _with_digest(label, experiments)))
@@ -174,24 +179,6 @@ def _read_ablation(experiments: Experiments, name: str, environment: str | None)
         with suppress(InputError):  # stored runs can be drawn without the files of their functions
             values = [_with_digest(value, experiments) for value in values]
     return Ablation(name, entry["method"], environment, entry["key"], to_tuples(values))
-
-
-def _ablation_specs(
-    experiments: Experiments, chosen: Ablation, profile: str, values: Sequence[Any] | None, overrides: Sequence[str]
-) -> dict[Any, RunSpec]:
-    name, method, environment, key, own_values = chosen
-    layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
-    layers += experiments.layers(ABLATION_LAYERS, ablation=name, profile=profile)
-    override_layers = _override_layers(overrides, method, environment, "--set")
-    if any(key in flatten(layer.values) for layer in override_layers):
-        raise InputError(f"{key} is what the ablation {name} varies; give its values with --values, not --set.")
-    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
-    specs: dict[Any, RunSpec] = {}
-    for value in own_values if values is None else values:
-        varied = Layer(source, _nested(key, value))
-        spec = _merge_layers(experiments, [*layers, *override_layers, varied], method, environment, profile)
-        specs[spec_value(spec, key)] = spec
-    return specs
 
 
 def _override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[Layer]:

@@ -1,6 +1,6 @@
-"""Reward shaping as values of a spec (sections 3.1.3 and A.2): what alpha is drawn from, and which label it gets.
+"""Values of a spec that shape the reward (sections 3.1.3 and A.2): the density of alpha, and the label of alpha.
 
-What they do is in `ssmail.losses.self_supervision` (drawing alpha) and `ssmail.losses.labels` (labels).
+`ssmail.losses.self_supervision` draws alpha, `ssmail.losses.labels` computes labels.
 """
 
 import math
@@ -11,14 +11,15 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator
 
 LABELS = ("identity", "zero-above-one")
-# "module:function", once its file is known "module:function@digest"; see ssmail.config.user_functions
+# "module:function", or "module:function@digest" once the file has been read; see ssmail.config.user_functions
 FUNCTION = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*)(@(?P<digest>[0-9a-f]{12}))?")
 
 
 def read_alpha(value: Any) -> Any:
-    """The density of alpha from what a file or the command line gives: a range [low, high] -> (low, high), or weighted
-    ranges [[low, high, weight], ...] -> ((low, high, weight), ...), a piecewise constant density whose weights are
-    relative; where ranges overlap the densities add up. Raises ValueError for anything else.
+    """Validate the density of alpha, and return its lists as tuples.
+
+    It is a range [low, high], or weighted ranges [[low, high, weight], ...]: a piecewise constant density with relative
+    weights, which add up where ranges overlap. Raises ValueError for anything else.
     """
     ranges = value if _is_list(value) and value and all(map(_is_list, value)) else [value]
     numbers = 2 if ranges is not value else 3
@@ -34,9 +35,10 @@ def read_alpha(value: Any) -> Any:
 
 
 def read_label(value: Any) -> Any:
-    """The label function from what a file or the command line gives: one of LABELS, "module:function", or knots
-    [[alpha, label], ...] -> ((alpha, label), ...) with rising alphas, of which two may be equal: a jump. Raises
-    ValueError for anything else.
+    """Validate a label of alpha, and return its lists as tuples.
+
+    It is one of LABELS, "module:function", or knots [[alpha, label], ...] of rising alpha. Two knots may share an
+    alpha, which makes a jump. Raises ValueError for anything else.
     """
     if isinstance(value, str) and (value in LABELS or FUNCTION.fullmatch(value)):
         return value
@@ -56,9 +58,9 @@ def _is_list(value: Any) -> bool:
     return isinstance(value, (list, tuple))
 
 
-def _is_row(value: Any, numbers: int) -> bool:
-    """Whether the value is a list of so many finite numbers."""
-    return _is_list(value) and len(value) == numbers and all(map(_is_number, value))
+def _is_row(value: Any, length: int) -> bool:
+    """Return whether the value is a list of this many finite numbers."""
+    return _is_list(value) and len(value) == length and all(map(_is_number, value))
 
 
 def _is_number(value: Any) -> bool:

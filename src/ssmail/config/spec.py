@@ -39,7 +39,7 @@ ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 _ADVERSARIAL = ("model", "adversarial", "sac", "curriculum", "training")
 _VARIATIONAL = ("variational", "cloning", "curriculum", "training")
 # The optional sections that each method and each environment requires. All others are null in its spec.
-SECTIONS: dict[str, tuple[str, ...]] = {
+METHOD_SECTIONS: dict[str, tuple[str, ...]] = {
     "ssail": (*_ADVERSARIAL, "self_supervision"),
     "gail": _ADVERSARIAL,
     "wail": (*_ADVERSARIAL, "wasserstein"),
@@ -50,8 +50,8 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "copy-last": (),
 }
 ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "letters": (), "mocap": ("forecast",)}
-OPTIONAL_SECTIONS = tuple(dict.fromkeys(chain(*SECTIONS.values(), *ENVIRONMENT_SECTIONS.values())))
-GENERATED = ("yjunction", "letters")  # environments with a data generator, configured by data.ENVIRONMENT
+OPTIONAL_SECTIONS = tuple(dict.fromkeys(chain(*METHOD_SECTIONS.values(), *ENVIRONMENT_SECTIONS.values())))
+GENERATED_ENVIRONMENTS = ("yjunction", "letters")  # environments with a data generator, configured by data.ENVIRONMENT
 
 # (section, key, value) of keys that were added after runs had been stored. Earlier runs behaved as the value says, so
 # it is left out of the hash.
@@ -67,7 +67,7 @@ _ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, wh
 
 
 class RunSpec(Frozen):
-    """Everything that defines a run except its seed. Sections that the method does not use are null (see SECTIONS)."""
+    """Everything that defines a run except its seed. Sections that it does not use are null (see METHOD_SECTIONS)."""
 
     method: Method
     environment: Environment
@@ -92,11 +92,11 @@ class RunSpec(Frozen):
             if needed != (getattr(self, name) is not None):
                 verb = "needs" if needed else "has no"
                 raise ValueError(f"{self.method} on {self.environment} {verb} section {name}")
-        for name in GENERATED:
+        for name in GENERATED_ENVIRONMENTS:
             needed = name == self.environment
             if needed != (getattr(self.data, name) is not None):
                 raise ValueError(f"environment {self.environment} {'needs' if needed else 'has no'} data.{name}")
-        if self.environment not in GENERATED and self.data.path is None:
+        if self.environment not in GENERATED_ENVIRONMENTS and self.data.path is None:
             raise ValueError(f"environment {self.environment} needs a data file; set data.path")
         return self
 
@@ -116,7 +116,7 @@ class RunSpec(Frozen):
 
 def required_sections(method: str, environment: str) -> tuple[str, ...]:
     """Return the optional sections that a spec of this method and environment must have."""
-    return (*SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
+    return (*METHOD_SECTIONS[method], *ENVIRONMENT_SECTIONS[environment])
 
 
 def spec_hash(stored: Mapping[str, Any]) -> str:
@@ -174,12 +174,12 @@ def check_section(key: str, method: str, environment: str, source: str) -> None:
     """
     if method not in METHODS or environment not in ENVIRONMENTS:
         return
-    for other in GENERATED:
+    for other in GENERATED_ENVIRONMENTS:
         if other != environment and f"{key}.".startswith(f"data.{other}."):
             raise InputError(f"environment {environment} has no section 'data.{other}' to set in {source}.")
     section = key.partition(".")[0]
     if section in OPTIONAL_SECTIONS and section not in required_sections(method, environment):
-        tables = {**SECTIONS, **ENVIRONMENT_SECTIONS}
+        tables = {**METHOD_SECTIONS, **ENVIRONMENT_SECTIONS}
         users = ", ".join(name for name, sections in tables.items() if section in sections)
         what = f"method {method} on {environment}"
         raise InputError(f"{what} has no section '{section}' to set in {source}; it belongs to {users}.")

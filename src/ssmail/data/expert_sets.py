@@ -30,7 +30,7 @@ COMMANDS = {
 
 
 def generate(data: DataSpec) -> ExpertSet:
-    """Generate the expert set of the environment whose parameters `data` has, one of config.spec.GENERATED.
+    """Generate the expert set of the environment in spec.GENERATED_ENVIRONMENTS whose parameters `data` has.
 
     Raises InputError for parameters that no set can have.
     """
