@@ -121,7 +121,12 @@ def collect(
         columns=columns,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(
+            NAME,
+            selection.runs,
+            curves={run.id: f"beta {group.value}" for group in selection.groups for run in group.runs},
+            options={"statistic": statistic},
+        ),
         notes=(*selection.notes, *_notes(columns)),
     )
 

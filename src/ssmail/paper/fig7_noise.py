@@ -174,7 +174,7 @@ def collect(
         panels=panels,
         noise=forecast["noise"],
         statistic=statistic,
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, noise, *(text for panel in panels for text in _panel_notes(panel))),
     )
 

@@ -33,5 +33,5 @@ class FigureRecord(Protocol):
         ...
 
     def table(self) -> "pd.DataFrame":
-        """Exactly what is shown, one row for each point. The column before `run_id` says what its curve is called."""
+        """Exactly what is shown, one row for each point."""
         ...

@@ -60,12 +60,6 @@ class TrainingRecord:
     notes: tuple[str, ...]
 
     @property
-    def options(self) -> dict[str, Any]:
-        """With which it was collected."""
-        metrics = [panel.metric for panel in self.panels]
-        return {"metrics": metrics, "group_by": self.group_by, "statistic": str(self.statistic)}
-
-    @property
     def stem(self) -> str:
         """The files' name without ending: other metrics, other files."""
         names = "_".join(panel.metric.replace("/", "-") for panel in self.panels)
@@ -94,6 +88,7 @@ def collect(
     runs = sorted(runs, key=lambda run: run.started)
     panels: list[Panel] = []
     drawn: dict[str, RunRow] = {}
+    curve_of: dict[str, str] = {}
     notes: list[str] = []
     reached = _reached(store, runs)
     for metric in dict.fromkeys(metrics):
@@ -105,14 +100,16 @@ def collect(
             check_one_data_set(NAME, group.runs)
         panels.append(Panel(metric, tuple(band(group, metric, values, statistic, reached) for group in groups)))
         drawn |= {run.id: run for group in groups for run in group.runs}
+        curve_of |= {run.id: group.label for group in groups for run in group.runs}
         notes += left_out
         if panels[-1].logarithmic:
             notes += curve_notes.cut(panels[-1].bands)
+    options = {"metrics": [panel.metric for panel in panels], "group_by": group_by, "statistic": statistic}
     return TrainingRecord(
         panels=tuple(panels),
         group_by=group_by,
         statistic=statistic,
-        provenance=Provenance.of(NAME, list(drawn.values())),
+        provenance=Provenance.of(NAME, list(drawn.values()), curves=curve_of, options=options),
         notes=tuple(notes),
     )
 
