@@ -30,7 +30,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
-from ssmail.plots.constant_velocity import constant_velocity
+from ssmail.plots.curves import constant_velocity
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, check_settled
 from ssmail.plots.series import figure_ablation, select
@@ -117,11 +117,12 @@ def collect(
     selection = select(store, NAME, runs, profile)
     check_settled(selection.runs, "test error")
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
+    curves = {run: f"beta {column.value}" for column in columns for run in column.run_ids}
     return BetaRecord(
         columns=columns,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves, {"statistic": statistic.value}),
         notes=(*selection.notes, *_notes(columns)),
     )
 
