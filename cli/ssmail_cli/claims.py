@@ -1,9 +1,10 @@
-"""`ssmail claims`: what the stored runs say of each claim of the paper."""
+"""`ssmail claims`: what the stored runs say about each claim of the paper."""
 
 import math
 import shutil
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -26,8 +27,8 @@ SUMMARY = {
 }
 WIDEST = 120  # columns of text
 LEGEND = (
-    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns all eight "
-    "claims; docs/claims.md has the tests and bars."
+    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns count all "
+    "eight claims; docs/claims.md has the tests and thresholds."
 )
 
 
@@ -35,24 +36,18 @@ def claims(
     only: Annotated[
         str | None,
         typer.Option(
-            "--only",
-            metavar="CLAIM[,CLAIM...]",
-            help="These claims alone, as C1 or stability.",
-            show_default="all of them",
+            "--only", metavar="CLAIM[,CLAIM...]", help="Only these claims: C1 or stability.", show_default="all"
         ),
     ] = None,
-    profile: Annotated[
-        str | None,
-        typer.Option("--profile", help="Runs of this profile.", show_default="the one that each figure draws"),
-    ] = None,
+    profile: options.FigureProfile = None,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Judge the paper's claims C1 to C8 by the stored runs: supported, contradicted or inconclusive.
 
-    Each part of a claim has a statistic and an exact test, defined beforehand (docs/claims.md), at 0.05; Holm's
-    correction for all eight claims stands beside it. Every seed counts. CSV has a row for each part, JSON everything.
+    Each part of a claim has a statistic and an exact test at 0.05, both fixed beforehand (docs/claims.md), and is also
+    corrected for all eight claims by Holm's method. Every seed counts. CSV has a row for each part, JSON everything.
     """
     from ssmail.paper.judgement import judge
 
@@ -61,7 +56,7 @@ def claims(
     judgements = judge(store, profile, wanted)
     kind = chosen_format(as_json, form)
     if kind is Format.JSON:
-        write_json([_nested(found) for found in judgements], None)
+        write_json([_as_json(found) for found in judgements], None)
         return
     for found in judgements:
         for remark in found.notes:
@@ -70,7 +65,7 @@ def claims(
         print_rows([row for found in judgements for row in _part_rows(found)], dict.fromkeys(_PART_COLUMNS, ""), kind)
         return
     for found in judgements:
-        typer.echo("\n".join([*_told(found), ""]))
+        typer.echo("\n".join([*_claim_lines(found), ""]))
     print_table([_summary(found) for found in judgements], SUMMARY)
     typer.echo("\n".join(_wrapped(LEGEND, 0)))
 
@@ -82,7 +77,7 @@ _PART_COLUMNS = (
 
 
 def _summary(found: "Judgement") -> dict[str, Any]:
-    """A claim as a row."""
+    """Return a claim as a row of the summary."""
     decision = found.decision
     unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
@@ -96,8 +91,8 @@ def _summary(found: "Judgement") -> dict[str, Any]:
     }
 
 
-def _nested(found: "Judgement") -> dict[str, Any]:
-    """A claim with all that is known of it."""
+def _as_json(found: "Judgement") -> dict[str, Any]:
+    """Return everything about a claim, for JSON."""
     claim, decision = found.claim, found.decision
     return {
         "claim": claim.name,
@@ -134,23 +129,20 @@ def _part_value(part: "Part") -> dict[str, Any]:
         "reason": part.reason,
         "statistic": part.statistic,
         "test": part.test,
-        "samples": [
-            {"label": sample.label, "seeds": sample.seeds, "values": sample.values, "runs": sample.runs}
-            for sample in part.samples
-        ],
+        "samples": [asdict(sample) for sample in part.samples],
     }
 
 
 def _part_rows(found: "Judgement") -> Iterator[dict[str, Any]]:
-    """A claim's parts as rows."""
+    """Yield the parts of a claim as rows of the CSV."""
     decision = found.decision
     verdict = {"claim_verdict": found.verdict.value, "claim_p": decision.p, "claim_p_holm": found.p_holm}
     claim = {"claim": found.claim.name, "alias": found.claim.alias, **verdict}
     yield from (claim | _part_value(part) for part in decision.parts)
 
 
-def _told(found: "Judgement") -> list[str]:
-    """A claim as lines of text."""
+def _claim_lines(found: "Judgement") -> list[str]:
+    """Return a claim as lines of text."""
     claim = found.claim
     lines = [f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}"]
     lines += _wrapped(claim.sentence, 2)
@@ -165,7 +157,7 @@ def _told(found: "Judgement") -> list[str]:
 
 def _part_lines(part: "Part") -> list[str]:
     lines = [
-        f"  - {part.statement}: {part.verdict}{_need(part)}",
+        f"  - {part.statement}: {part.verdict}{_lack(part)}",
         *_wrapped(part.statistic, 6),
         *_wrapped(part.test, 6),
     ]
@@ -178,8 +170,8 @@ def _part_lines(part: "Part") -> list[str]:
     return lines
 
 
-def _need(part: "Part") -> str:
-    """What an inconclusive part lacks."""
+def _lack(part: "Part") -> str:
+    """Return what an inconclusive part lacks."""
     if part.reason:
         return f", {part.reason}"
     if part.more_seeds is None:
@@ -188,10 +180,10 @@ def _need(part: "Part") -> str:
 
 
 def _seeds(sample: "Sample") -> str:
-    """Every seed's value."""
-    values: Sequence[tuple[int, float]] = list(zip(sample.seeds, sample.values, strict=True))
-    told = ", ".join(f"{seed}: {'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in values)
-    return f"{sample.label}, seed by seed: {told or 'no runs'}"
+    """Return the value of every seed."""
+    pairs = zip(sample.seeds, sample.values, strict=True)
+    values = ", ".join(f"{seed}: {'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in pairs)
+    return f"{sample.label}, seed by seed: {values or 'no runs'}"
 
 
 def _wrapped(text: str, indent: int) -> list[str]:

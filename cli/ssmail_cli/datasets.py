@@ -47,8 +47,8 @@ def generate_yjunction(
 ) -> None:
     """Generate the Y-Junction expert set.
 
-    In each trajectory a file of agents takes one of two lanes. The .npz holds the three splits, their parameters and
-    a hash. Train on it with --set data.path=FILE; without a file training generates the default set by itself.
+    In each trajectory, agents in single file take one of two lanes. The .npz holds the three splits, their parameters
+    and a hash. Train on it with --set data.path=FILE; without a file, training generates the default set itself.
     """
     given = {
         "train": train,
@@ -67,7 +67,7 @@ def generate_letters(
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/letters.npz"),
     word: Annotated[
         str | None,
-        typer.Option("--word", help="1 to 6 capital letters, an agent for each.", show_default=IN_FILE),
+        typer.Option("--word", help="1 to 6 capital letters, one agent each.", show_default=IN_FILE),
     ] = None,
     train: Train = None,
     validation: Validation = None,
@@ -81,9 +81,9 @@ def generate_letters(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Generate the expert set of the letters.
+    """Generate the letters expert set.
 
-    Each agent draws a letter of the word. The .npz holds the three splits, the letters as drawn without jitter, their
+    Each agent draws a letter of the word. The .npz holds the three splits, the letters drawn without jitter, their
     parameters and a hash. Train on it with --env letters --set data.path=FILE, or without a file on another word with
     --env letters --set data.letters.word=WORD.
     """
@@ -102,30 +102,30 @@ def generate_letters(
 def prep_mocap(
     source: Annotated[
         Path | None,
-        typer.Option("--source", help="Folder or zip file that holds, at any depth, 35.asf and 35_01.amc ..."),
+        typer.Option("--source", help="Folder or zip file that contains 35.asf and 35_01.amc ... at any depth."),
     ] = None,
     download: Annotated[
-        bool, typer.Option("--download", help="Fetch the files from the CMU site instead, slowly, into --cache.")
+        bool, typer.Option("--download", help="Fetch the files from the (slow) CMU site into --cache instead.")
     ] = False,
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", help="With --download: where its files are kept.", show_default=DEFAULT_CACHE),
+        typer.Option("--cache", help="With --download: folder to keep the files in.", show_default=DEFAULT_CACHE),
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/mocap.npz"),
     subject: Annotated[int, typer.Option("--subject", min=1, max=999, help="Number of the subject.")] = 35,
-    train: Annotated[str, typer.Option("--train", help="Trials to train on, as 01-12 or 1-3,7.")] = "01-12",
+    train: Annotated[str, typer.Option("--train", help="Trials to train on: 01-12 or 1-3,7.")] = "01-12",
     validation: Annotated[str, typer.Option("--validation", "--val", help="Trials to validate on.")] = "13-16",
     test: Annotated[str, typer.Option("--test", help="Trials to test on.")] = "28-34",
     allow_missing: Annotated[
-        bool, typer.Option("--allow-missing", help="Go on without the trials that are not there.")
+        bool, typer.Option("--allow-missing", help="Continue without trials that do not exist.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
     as_json: Json = False,
 ) -> None:
     """Prepare the Noisy Mocap expert set from files of the CMU motion capture database.
 
-    The trials are cut into windows of 50 frames, and of 100 for testing. The .npz holds positions and velocities of
-    all joints in the files' own units, the skeleton, and where each window is from. Train on it with --env mocap.
+    Cuts the trials into windows of 50 frames, and of 100 for testing. The .npz holds positions and velocities of all
+    joints in the units of the files, the skeleton, and the origin of each window. Train on it with --env mocap.
     """
     from ssmail.data import expert_sets
     from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
@@ -152,7 +152,7 @@ def prep_mocap(
 
 
 def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
-    """The data section of experiments.yaml with the options that were given. Raises InputError for a bad one."""
+    """Return the data section of experiments.yaml with the given options. Raises InputError for an invalid one."""
     from ssmail.config.experiments import build_spec
     from ssmail.config.spec import METHODS
 
@@ -204,4 +204,4 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
             typer.echo(f"training {what} from {low:#.6g} to {high:#.6g}")
     if missing:
         trials = ", ".join(f"{trial:02d}" for trial in missing)
-        note(f"trials that were asked for but are not there, so not in the set: {trials}")
+        note(f"trials that do not exist and are not in the set: {trials}")

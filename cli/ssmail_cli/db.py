@@ -1,4 +1,4 @@
-"""`ssmail db`: the database itself: what it holds, whether it is sound, copies of it, and others brought into it."""
+"""`ssmail db`: inspect, upgrade, check, back up, merge and export the database."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import ExitCode, InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, write_json
@@ -22,15 +22,14 @@ app = typer.Typer(help="Inspect, check, back up, merge and export an SQLite data
 
 COUNT_COLUMNS = {"environment": "env", "method": "method", "profile": "profile", "state": "state", "runs": "runs"}
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]
-PROBLEMS = 1
 
 
 @app.command()
 def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
     """Show what the database holds.
 
-    The file, the revision of its schema, its size, how much of it the arrays are, and the runs by environment, method,
-    profile and state. It is not upgraded.
+    Prints the revision of its schema, its size, the share of the arrays, and the number of runs by environment, method,
+    profile and state. Does not upgrade it.
     """
     from ssmail.store.maintenance.sqlite_file import describe_contents
 
@@ -51,16 +50,16 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
 def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
     """Bring the tables to the newest schema.
 
-    A backup of the old state is written beside the file first. Any command that opens an older database upgrades it,
+    First writes a backup beside the file. All other commands also upgrade an older database when they open it, but
     without a backup.
     """
-    from ssmail.store.maintenance.backup import upgrade as upgrade_database
+    from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
         write_json(asdict(done), None)
     elif done.before == done.after:
-        print(f"{done.path} has the newest schema, {done.after}, already")
+        print(f"{done.path} already has the newest schema, {done.after}")
     else:
         kept = f"; the old state is in {done.backup}" if done.backup else ""
         print(f"{done.path}: from schema {done.before or 'none'} to {done.after}{kept}")
@@ -70,8 +69,8 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
     """Look for problems in the database and its checkpoints.
 
-    Prints one line for each, with its remedy, and changes nothing. Exit code 0: none, 1: some. It reads the whole file
-    and all checkpoints, and may be used while runs are being computed.
+    Prints one line for each problem, with its remedy, and changes nothing. Reads the whole file and all checkpoints;
+    safe while runs are being computed. Exit code 1: there are problems.
     """
     from ssmail.store.maintenance.checks import check as check_database
 
@@ -82,7 +81,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
         print(f"{problem.check}: {problem.problem}; {problem.remedy}")
     note(f"{db}: {counted(len(problems), 'problem')}" if problems else f"{db}: no problem found")
     if problems:
-        raise typer.Exit(PROBLEMS)
+        raise typer.Exit(ExitCode.FAILURE)
 
 
 @app.command()
@@ -93,9 +92,9 @@ def backup(
 ) -> None:
     """Copy the database to a new file.
 
-    Safe while runs are being computed. Checkpoints are files of their own and are not copied.
+    Safe while runs are being computed. Checkpoints, which are separate files, are not copied.
     """
-    from ssmail.store.maintenance.backup import back_up
+    from ssmail.store.maintenance.sqlite_file import back_up
 
     size = back_up(db, file)
     if as_json:
@@ -110,10 +109,11 @@ def merge(
     as_json: Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Bring the runs of another database into this one.
+    """Add the runs of another database to this one.
 
-    With their checkpoints, and all of them or none. Of two runs of one spec, seed and data the one that got further is
-    kept; of two that ended, the first, and if they differ that is reported. Runs that are being computed are left out.
+    Copies their checkpoints too; adds all runs or none. Of two runs with the same spec, seed and data, keeps the one
+    that got further; of two that ended, keeps the one already there and reports differences. Runs that are being
+    computed are left out.
     """
     from ssmail.store.maintenance.merge import merge as merge_databases
 
@@ -132,7 +132,7 @@ def merge(
 def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write; it must not exist.")],
     compact: Annotated[
-        bool, typer.Option("--compact", help="Only what figures and claims need. (For a whole copy: ssmail db backup.)")
+        bool, typer.Option("--compact", help="Only what figures and claims need; `ssmail db backup` copies everything.")
     ] = False,
     method: options.Method = None,
     environment: options.Environment = None,
@@ -143,8 +143,8 @@ def export(
 ) -> None:
     """Write a small database that draws all figures and judges all claims.
 
-    The newest finished or diverged run of each spec and seed, with the last value of every metric, the curves and
-    arrays that figures and claims read, and no checkpoints. What is left out is told.
+    Keeps the newest finished or diverged run of each spec and seed, with the last value of every metric and the curves
+    and arrays that figures and claims read, but no checkpoints. Reports what is left out.
     """
     from functools import partial
 
@@ -171,7 +171,7 @@ def export(
     if as_json:
         write_json({**asdict(done), "left_out_runs": others, "undrawable": needed.undrawable}, None)
     else:
-        _tell(done, needed, others)
+        _print_export(done, needed, others)
 
 
 def _summary(found: "DatabaseInformation") -> str:
@@ -187,16 +187,16 @@ def _summary(found: "DatabaseInformation") -> str:
 
 
 def _fates(done: "Merge") -> str:
-    """ "3 runs added, 2 already there"; every fate that some run had."""
+    """Return what happened to the runs: "3 runs added, 2 runs there already"."""
     from ssmail.store.maintenance.merge import Fate
 
     words = {
         Fate.ADDED: "added",
-        Fate.REPLACED: "put in the place of runs that had less",
+        Fate.REPLACED: "replaced runs that had got less far",
         Fate.ALREADY_THERE: "there already",
-        Fate.BEHIND: "left out: less far than the run that is there",
+        Fate.BEHIND: "left out: less far than the run already there",
         Fate.BUSY: "left out: being computed",
-        Fate.DIFFERENT: "left out: different from the run that is there",
+        Fate.DIFFERENT: "left out: different from the run already there",
     }
     counts = [f"{counted(done.count(fate), 'run')} {text}" for fate, text in words.items() if done.count(fate)]
     return ", ".join(counts) or "no runs in it"
@@ -219,8 +219,8 @@ def _merge_json(done: "Merge") -> dict[str, Any]:
     return {**names, "runs": runs, "differences": differences, "without_checkpoints": done.without_checkpoints}
 
 
-def _tell(done: "Compact", needed: "Needs", others: int) -> None:
-    """The file on stdout, what is not in it on stderr."""
+def _print_export(done: "Compact", needed: "Needs", others: int) -> None:
+    """Print the file on stdout, and what is not in it on stderr."""
     print(f"wrote {done.path}, {_size(done.size_bytes)}: {counted(done.runs, 'run')}")
     note(
         f"left out: {counted(others, 'other run')}; {counted(done.left_out_artifacts, 'checkpoint file')}; "
@@ -233,5 +233,5 @@ def _tell(done: "Compact", needed: "Needs", others: int) -> None:
 
 
 def _size(size: int) -> str:
-    """Bytes for people: "12 kB", "8.9 MB"."""
+    """Return a number of bytes as "12 kB" or "8.9 MB"."""
     return f"{size / 1e3:.0f} kB" if size < 1e6 else f"{size / 1e6:.1f} MB"

@@ -1,4 +1,4 @@
-"""`ssmail explain`: what a saved figure is drawn from, and whether the database still agrees."""
+"""`ssmail explain`: the runs behind a saved figure, and whether the database still agrees with it."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ssmail.errors import ExitCode
 from ssmail.plots.formatting import short_code
 from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, short, write_json
@@ -13,18 +14,7 @@ from ssmail_cli.output import Format, chosen_format, note, print_rows, short, wr
 if TYPE_CHECKING:
     from ssmail.paper.explanation import Agreement, Explanation
 
-DISAGREES = 1
-COLUMNS = {
-    "curve": "curve",
-    "run": "run",
-    "seed": "seed",
-    "state": "state",
-    "spec": "spec",
-    "differs": "differs",
-    "data": "data",
-    "code": "code",
-    "database": "database",
-}
+COLUMNS = {name: name for name in ("curve", "run", "seed", "state", "spec", "differs", "data", "code", "database")}
 
 
 def explain(
@@ -35,11 +25,11 @@ def explain(
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Tell what a saved figure is drawn from.
+    """Show which runs a saved figure is drawn from.
 
-    The runs behind each curve, with the spec (and in what the specs of a method differ), data and code of each, and
-    whether the database still agrees: the same runs, and the same values when the figure is collected from them again.
-    Exit code 0: it agrees, or cannot be asked; 1: it does not.
+    Lists the runs behind each curve, with spec (and how the specs of a method differ), data and code of each. Also
+    collects the figure from the database again, and reports whether the runs and the values are still the same. Exit
+    code 1: they are not; 0: they are, or there is nothing to compare with.
     """
     from ssmail.paper.explanation import compare
     from ssmail.paper.explanation import explain as explain_figure
@@ -56,7 +46,7 @@ def explain(
         if rows := _rows(found, agreement):
             print_rows(rows, COLUMNS, kind)
     if agreement is not None and agreement.agrees is False:
-        raise typer.Exit(DISAGREES)
+        raise typer.Exit(ExitCode.FAILURE)
 
 
 def _heading(found: "Explanation") -> list[str]:
@@ -78,7 +68,7 @@ def _verdict(agreement: "Agreement | None", db: str) -> str:
     of = f"of {len(agreement.runs)} runs"
     parts = [f"{missing} {of} missing"] * bool(missing) + [f"{changed} {of} changed"] * bool(changed)
     if agreement.agrees:
-        return f"{agreement.where} agrees: all runs are there, and give the same values"
+        return f"{agreement.where} agrees: it holds all runs, with the same values"
     if agreement.values == "different":
         parts.append(f"the values differ: {agreement.reason}")
     if agreement.agrees is False:
@@ -87,7 +77,7 @@ def _verdict(agreement: "Agreement | None", db: str) -> str:
 
 
 def _rows(found: "Explanation", agreement: "Agreement | None") -> list[dict[str, Any]]:
-    """A row for each run, with short ids and hashes."""
+    """Return a row for each run, with short ids and hashes."""
     source = found.provenance
     states = agreement.runs if agreement is not None else {}
     rows: list[dict[str, Any]] = [

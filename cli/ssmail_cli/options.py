@@ -64,7 +64,9 @@ FigureProfile = Annotated[
 ]
 State = Annotated[
     str | None,
-    typer.Option("--state", help="Only runs in this state: running, finished, failed, diverged or interrupted."),
+    typer.Option(
+        "--state", help="Only runs in this state: queued, running, finished, failed, diverged or interrupted."
+    ),
 ]
 Figure = Annotated[str | None, typer.Option("--figure", help="Only runs that this figure of the paper needs: fig5.")]
 
@@ -106,14 +108,14 @@ StatOfFigures = Annotated[
 
 
 def is_missing(database: str) -> bool:
-    """Whether this is the path of a file that does not exist; of a URL only the database itself can tell."""
+    """Return whether this is the path of a file that does not exist; False for a URL."""
     return "://" not in database and not Path(database).expanduser().exists()
 
 
 def open_store(database: str) -> "Store":
-    """The store of a command that reads; runs whose process has died are marked interrupted first, where possible.
+    """Open the store for reading, after marking runs whose process has died as interrupted, where possible.
 
-    Raises InputError when the file is missing: reading must not make one.
+    Raises InputError when the file does not exist: reading must not create it.
     """
     from ssmail.store import Store
 
@@ -150,7 +152,7 @@ def select_runs(
 
 
 def parse_seeds(text: str) -> list[int]:
-    """ "0-2,7" -> [0, 1, 2, 7], in the order given and each once. Raises InputError for anything else."""
+    """ "0-2,7" -> [0, 1, 2, 7], in the given order and each once. Raises InputError for anything else."""
     seeds: dict[int, None] = {}
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
@@ -166,7 +168,7 @@ def parse_seeds(text: str) -> list[int]:
 
 
 def pick_device(choice: Device) -> str:
-    """ "cpu" or "cuda". Raises InputError for cuda without one."""
+    """Return "cpu" or "cuda". Raises InputError for cuda without a GPU."""
     if choice is Device.CPU:
         return "cpu"
     import torch
@@ -174,7 +176,7 @@ def pick_device(choice: Device) -> str:
     if torch.cuda.is_available():
         return "cuda"
     if choice is Device.CUDA:
-        raise InputError("--device cuda needs a CUDA GPU and none is found; use --device cpu.")
+        raise InputError("--device cuda needs a CUDA GPU, and none is found; use --device cpu.")
     return "cpu"
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import InputError
+from ssmail.errors import ExitCode, InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
@@ -44,9 +44,9 @@ def list_runs(
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """List runs with their test error.
+    """List runs with their test error, the newest last.
 
-    The newest comes last; CSV and JSON have every column.
+    CSV and JSON have every column.
     """
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
@@ -70,7 +70,7 @@ def show(
 ) -> None:
     """Show everything about one run.
 
-    Its columns, its spec, the last value of each metric, its arrays and its files.
+    Prints its columns, its spec, the last value of each metric, its arrays and its files.
     """
     store = options.open_store(db)
     (found,) = store.runs(ids=[run])
@@ -100,8 +100,8 @@ def compare(
 ) -> None:
     """Compare specs over their seeds.
 
-    Shows mean, standard deviation (n - 1), median and the value of each seed's newest run. Runs that differ in the seed
-    alone are one group. No run is left out: one without the metric shows its state.
+    Groups the runs that differ only in the seed, and shows mean, standard deviation (n - 1), median and the value of
+    each seed's newest run; for a run without the metric, its state.
     """
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
@@ -134,7 +134,7 @@ def export(
     figure: options.Figure = None,
     as_json: options.Json = False,
     form: Annotated[
-        Format, typer.Option("--format", help="csv: a line for each value; json: runs with specs and metrics.")
+        Format, typer.Option("--format", help="csv: one line per value; json: runs with specs and metrics.")
     ] = Format.CSV,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
@@ -158,7 +158,7 @@ def delete(
 ) -> None:
     """Delete runs and their checkpoints.
 
-    Everything that they recorded goes; a run that is being computed is refused.
+    Refuses to delete a run that is being computed.
     """
     import sys
 
@@ -167,16 +167,16 @@ def delete(
     names = ", ".join(f"{run.name} ({run.method}, seed {run.seed}, {run.state})" for run in runs)
     if not yes:
         if not sys.stdin.isatty():
-            raise InputError(f"nothing is deleted without a yes; give --yes to delete {names}.")
+            raise InputError(f"deleting needs a confirmation; give --yes to delete {names}.")
         if not typer.confirm(f"Delete {names}?", err=True):
             note("nothing deleted")
-            raise typer.Exit(1)
+            raise typer.Exit(ExitCode.FAILURE)
     store.delete([run.id for run in runs])
     note(f"deleted {names}")
 
 
 def _metrics(store: "Store", run: "RunRow") -> list[dict[str, Any]]:
-    """Every recorded value of a run: name, step, value."""
+    """Return every recorded value of a run: name, step, value."""
     frame = store.metrics([run.id])
     return [
         {"name": name, "step": step, "value": value}
@@ -206,7 +206,7 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
 
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The same, flat: section, name, step (of a metric), value."""
+    """Yield the details as rows: section, name, step (of a metric), value."""
     from ssmail.config.spec import flatten
 
     for section in ("run", "spec"):
@@ -221,7 +221,7 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> None:
-    """Runs downwards, with one column for the test error, whatever it is called in the environment of each."""
+    """Print one row per run; the test error, whose name depends on the environment, is one column."""
     name = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
     short_rows = [
         {**row, "spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
@@ -231,7 +231,7 @@ def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> Non
 
 
 def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] | None) -> "list[Comparison]":
-    """Environment by environment, by the metrics asked for or by those of each."""
+    """Compare the runs of each environment by the given metrics, or by those of the environment."""
     from ssmail.store.comparison import compare_runs
 
     return [
@@ -251,8 +251,8 @@ def _headings(group: "list[Comparison]") -> dict[str, str]:
 
 
 def _print_comparisons(found: "list[Comparison]") -> None:
-    """A table for each spec: its seeds downwards, then mean, std and median; the metrics across. Then one for all specs
-    of an environment.
+    """Print a table for each spec, with a row for each seed, mean, std and median and a column for each metric; then a
+    table of the specs of each environment.
     """
     specs = _by_spec(found)
     for group in specs:
@@ -273,12 +273,12 @@ def _print_comparisons(found: "list[Comparison]") -> None:
 
 
 def _by_spec(found: "list[Comparison]") -> "list[list[Comparison]]":
-    """Those of one spec, a metric each, together; they follow one another already."""
+    """Group the comparisons of each spec (one per metric); they are consecutive."""
     return [list(group) for _, group in groupby(found, key=lambda item: item.spec_hash)]
 
 
 def _print_overviews(environments: "list[list[list[Comparison]]]") -> None:
-    """For each environment a row for each spec; `seeds` tells how many of its seeds have the first metric."""
+    """Print a table for each environment, with a row for each spec; `seeds` counts those with the first metric."""
     for number, specs in enumerate(environments):
         where = specs[0][0].environment
         between = "\n" if number else ""
@@ -307,7 +307,7 @@ def _seed_label(item: "Comparison", seed: int) -> str:
 
 
 def _comparison_row(item: "Comparison", seeds: Sequence[int], kind: Format) -> dict[str, Any]:
-    """One spec and metric, as CSV (a column for each seed) or JSON."""
+    """Return one spec and metric as a row of CSV (with a column for each seed) or JSON."""
     each = {seed: item.states[seed].value if value is None else value for seed, value in item.values.items()}
     row = {
         "method": item.method,

@@ -68,7 +68,7 @@ def test_backup_and_upgrade(cli: CommandLine, filled: Path, tmp_path: Path) -> N
     assert cli("db", "backup", copy, "--db", filled).out.startswith(f"wrote {copy}, ")
     assert contents(copy) == contents(filled)
     assert "exists already and is not overwritten" in cli("db", "backup", copy, "--db", filled).sentence
-    assert cli("db", "upgrade", "--db", filled).out == f"{filled} has the newest schema, 0001, already\n"
+    assert cli("db", "upgrade", "--db", filled).out == f"{filled} already has the newest schema, 0001\n"
     assert json.loads(cli("db", "upgrade", "--json", "--db", filled).out)["backup"] is None
 
 
@@ -86,7 +86,7 @@ def test_merge(cli: CommandLine, filled: Path, tmp_path: Path) -> None:
         f"run {ours.name}, which is kept, and 0.125 in run {theirs[:8]}, which is left out"
     )
     assert summary == (
-        f"merged {other.where} into {filled}: 1 run added, 1 run left out: different from the run that is there"
+        f"merged {other.where} into {filled}: 1 run added, 1 run left out: different from the run already there"
     )
     found = json.loads(cli("db", "merge", other.where, "--json", "--db", filled).out)
     assert {run["fate"] for run in found["runs"]} == {"different", "already there"}

@@ -34,7 +34,7 @@ def test_the_runs_and_that_the_database_agrees(cli: CommandLine, drawn: Path, db
     first, *_, last = shown.err.splitlines()
     assert first.startswith(f"{drawn}: training, metrics [validation/mode_mse], group_by method, statistic mean-std; ")
     assert f"CSV: {drawn.stem}.csv is as it was written with the figure" in shown.err
-    assert last == f"{db} agrees: all runs are there, and give the same values"
+    assert last == f"{db} agrees: it holds all runs, with the same values"
     assert cli("explain", drawn.with_suffix(".csv"), "--db", db) == shown
     found = json.loads(cli("explain", drawn, "--json", "--db", db).out)
     assert (found["figure"], found["database"]["agrees"], found["csv"]["state"]) == ("training", True, "as written")

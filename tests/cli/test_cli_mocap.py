@@ -50,7 +50,7 @@ def test_json_for_programs(cli: CommandLine, folder: Path, tmp_path: Path) -> No
     assert told["missing"] == [2]
     assert told["parameters"] == experts.parameters
     assert told["sources"] == experts.sources
-    assert outcome.err == "trials that were asked for but are not there, so not in the set: 02\n"
+    assert outcome.err == "trials that do not exist and are not in the set: 02\n"
 
 
 def test_another_subject_in_a_zip_file(cli: CommandLine, tmp_path: Path) -> None:

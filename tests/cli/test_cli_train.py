@@ -215,7 +215,7 @@ def test_nothing_to_resume(cli: CommandLine, db: Path, options: list[str]) -> No
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")
 def test_cuda_without_a_gpu(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     sentence = cli("train", "--profile", "smoke", "--device", "cuda", "--db", db).sentence
-    assert sentence == "--device cuda needs a CUDA GPU and none is found; use --device cpu."
+    assert sentence == "--device cuda needs a CUDA GPU, and none is found; use --device cpu."
     given = fake()
     assert cli("train", "--profile", "smoke", "--device", "auto", "--db", db).code == 0
     assert given["device"] == "cpu"

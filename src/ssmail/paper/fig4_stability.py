@@ -94,7 +94,7 @@ def collect(
         bands=bands,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs, selection.curves, {"statistic": statistic.value}),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, *curve_notes.of_errors(bands)),
     )
 

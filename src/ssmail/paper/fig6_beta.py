@@ -117,12 +117,16 @@ def collect(
     selection = select(store, NAME, runs, profile)
     check_settled(selection.runs, "test error")
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
-    curves = {run: f"beta {column.value}" for column in columns for run in column.run_ids}
     return BetaRecord(
         columns=columns,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs, curves, {"statistic": statistic.value}),
+        provenance=Provenance.of(
+            NAME,
+            selection.runs,
+            curves={run.id: f"beta {group.value}" for group in selection.groups for run in group.runs},
+            options={"statistic": statistic},
+        ),
         notes=(*selection.notes, *_notes(columns)),
     )
 

@@ -173,7 +173,7 @@ def collect(
         panels=panels,
         noise=forecast["noise"],
         statistic=statistic,
-        provenance=Provenance.of(NAME, selection.runs, selection.curves, {"statistic": statistic.value}),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, noise, *(text for panel in panels for text in _panel_notes(panel))),
     )
 

@@ -110,7 +110,7 @@ def collect(
         losses=losses,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs, kind),
-        provenance=Provenance.of(NAME, selection.runs, selection.curves, {"statistic": statistic.value}),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, which, *curve_notes.of_errors(errors)),
     )
 

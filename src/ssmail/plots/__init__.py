@@ -33,5 +33,5 @@ class FigureRecord(Protocol):
         ...
 
     def table(self) -> "pd.DataFrame":
-        """Return exactly what is shown, one row for each point."""
+        """Exactly what is shown, one row for each point."""
         ...

@@ -61,15 +61,16 @@ class Provenance:
         cls,
         figure: str,
         runs: Sequence[RunRow],
+        *,
         curves: Mapping[str, str] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> Self:
         """Return the provenance of a figure drawn from these runs.
 
-        curves: the name in the figure of the curve that each run is part of, by run id; its method where there is none.
-        options: those that `collect` takes beside the store and the runs, as JSON values.
+        `curves` names, by run id, the curve that a run is drawn in; without a name it is the run's method. `options`
+        are the arguments of `collect` other than the store and the runs, as JSON values.
         """
-        names = curves or {}
+        curves = curves or {}
         return cls(
             figure=figure,
             run_ids=tuple(run.id for run in runs),
@@ -77,7 +78,7 @@ class Provenance:
             dataset_hashes=_distinct(run.dataset_hash for run in runs if run.dataset_hash),
             code=_distinct(run.code for run in runs),
             drawn_with=__version__,
-            runs=tuple(_source(run, names.get(run.id, run.method)) for run in runs),
+            runs=tuple(_source(run, curves.get(run.id, run.method)) for run in runs),
             differs=spec_differences(runs),
             options=dict(options or {}),
         )

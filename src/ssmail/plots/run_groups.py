@@ -40,7 +40,7 @@ class Selection:
 
     @property
     def curves(self) -> dict[str, str]:
-        """The label of the group that each run is in, by run id."""
+        """By run id, the label of the group that the run is drawn in."""
         return {run.id: group.label for group in self.groups for run in group.runs}
 
 

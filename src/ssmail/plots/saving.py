@@ -44,5 +44,5 @@ def digest(csv: str) -> str:
 
 
 def embedded(record: FigureRecord, csv: str) -> Provenance:
-    """Return what is written into the files: the record's provenance, with the hash of its CSV."""
+    """Return the provenance that is written into the files: the record's, with the hash of its CSV."""
     return replace(record.provenance, csv_sha256=digest(csv))

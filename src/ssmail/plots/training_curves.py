@@ -88,6 +88,7 @@ def collect(
     runs = sorted(runs, key=lambda run: run.started)
     panels: list[Panel] = []
     drawn: dict[str, RunRow] = {}
+    curve_of: dict[str, str] = {}
     notes: list[str] = []
     reached = _reached(store, runs)
     for metric in dict.fromkeys(metrics):
@@ -99,19 +100,15 @@ def collect(
             check_one_data_set(NAME, group.runs)
         panels.append(Panel(metric, tuple(band(group, metric, values, statistic, reached) for group in groups)))
         drawn |= {run.id: run for group in groups for run in group.runs}
+        curve_of |= {run.id: group.label for group in groups for run in group.runs}
         notes += left_out
         if panels[-1].logarithmic:
             notes += curve_notes.cut(panels[-1].bands)
-    curves_of_runs = {curve.run_id: shown.label for panel in panels for shown in panel.bands for curve in shown.curves}
-    options = {
-        "metrics": [panel.metric for panel in panels],
-        "group_by": group_by,
-        "statistic": statistic.value,
-    }
+    options = {"metrics": [panel.metric for panel in panels], "group_by": group_by, "statistic": statistic}
     return TrainingRecord(
         panels=tuple(panels),
         statistic=statistic,
-        provenance=Provenance.of(NAME, list(drawn.values()), curves_of_runs, options),
+        provenance=Provenance.of(NAME, list(drawn.values()), curves=curve_of, options=options),
         notes=tuple(notes),
     )
 
