@@ -3,8 +3,9 @@ SHELL := bash
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+DOCS_INSTALLED := .venv/.installed-docs
 
-.PHONY: help venv demo test test-slow check bench clean
+.PHONY: help venv demo test test-slow check docs bench clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -34,6 +35,14 @@ check: $(INSTALLED)  ## lint, format and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+
+$(DOCS_INSTALLED): $(INSTALLED)
+	$(BIN)/pip install --quiet -c constraints.txt -e '.[docs]'
+	@touch $@
+
+docs: $(DOCS_INSTALLED)  ## the documentation site, with command and API reference, in build/docs; a warning fails it
+	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -j auto -c docs . build/docs
+	@echo "Now open build/docs/README.html."
 
 bench: $(INSTALLED)  ## how long the command line, an epoch, the store and a training step take (about 10 minutes)
 	$(BIN)/python benchmarks/run.py

@@ -53,7 +53,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     First writes a backup beside the file. All other commands also upgrade an older database when they open it, but
     without a backup.
     """
-    from ssmail.store.maintenance.backup import upgrade as upgrade_database
+    from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
@@ -94,7 +94,7 @@ def backup(
 
     Safe while runs are being computed. Checkpoints, which are separate files, are not copied.
     """
-    from ssmail.store.maintenance.backup import back_up
+    from ssmail.store.maintenance.sqlite_file import back_up
 
     size = back_up(db, file)
     if as_json:

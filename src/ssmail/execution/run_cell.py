@@ -2,7 +2,7 @@
 
 import threading
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Protocol
@@ -20,23 +20,12 @@ from ssmail.training.loop import Divergence, TrainingLoop, load_checkpoint, save
 
 
 class Loop(Protocol):
-    """The part of TrainingLoop that `run_cell` uses."""
+    """The part of TrainingLoop that `run_cell` uses. Tests substitute simple loops."""
 
-    @property
-    def epoch(self) -> int:
-        """The number of completed epochs."""
-
-    @property
-    def dataset_hash(self) -> str:
-        """The hash of the expert data."""
-
-    @property
-    def snapshot(self) -> Mapping[str, np.ndarray]:
-        """The arrays to store for the last epoch."""
-
-    @property
-    def improved(self) -> bool:
-        """Whether the last epoch's model is the best so far."""
+    epoch: int  # completed epochs
+    dataset_hash: str
+    improved: bool  # whether the last epoch's model is the best so far
+    snapshot: dict[str, np.ndarray]  # the arrays to store for the last epoch
 
     def run_epoch(self) -> dict[str, float]:
         """Train one epoch and return its metrics. Raises Divergence."""
@@ -123,7 +112,8 @@ def _train(
     # Each epoch is written in this order: metrics, arrays, checkpoint. So a checkpoint is never ahead of the database,
     # and what a killed process stored after its last checkpoint is computed again, to the same bits.
     epochs = cell.spec.epochs
-    _store_snapshot(writer, loop.snapshot)
+    if loop.snapshot:
+        writer.arrays(loop.snapshot)
     while loop.epoch < epochs:
         if should_stop():
             writer.finish(RunState.INTERRUPTED, f"stopped after epoch {loop.epoch}")
@@ -135,7 +125,8 @@ def _train(
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
-        _store_snapshot(writer, loop.snapshot)
+        if loop.snapshot:
+            writer.arrays(loop.snapshot)
         if loop.improved:
             save_checkpoint(folder / BEST, loop.best_state_dict())
         save_checkpoint(folder / LAST, loop.state_dict())
@@ -146,11 +137,6 @@ def _train(
     _record_checkpoints(writer, folder)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
-
-
-def _store_snapshot(writer: RunWriter, snapshot: Mapping[str, np.ndarray]) -> None:
-    if snapshot:
-        writer.arrays(snapshot)
 
 
 def _record_checkpoints(writer: RunWriter, folder: Path) -> None:

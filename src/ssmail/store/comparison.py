@@ -65,11 +65,21 @@ def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -
     specs: dict[str, list[RunRow]] = {}
     for run in newest.values():
         specs.setdefault(run.spec_hash, []).append(run)
+    by_seed = {spec: sorted(found, key=lambda run: run.seed) for spec, found in specs.items()}
     differences = spec_differences(runs)
     latest = latest_values(store, list(newest.values()), metrics)
     return [
-        _comparison(sorted(found, key=lambda run: run.seed), differences[spec], metric, latest)
-        for spec, found in specs.items()
+        Comparison(
+            method=found[0].method,
+            environment=found[0].environment,
+            profile=found[0].profile,
+            spec_hash=spec,
+            differs=differences[spec],
+            metric=metric,
+            values={run.seed: latest.get((run.id, metric)) for run in found},
+            states={run.seed: run.state for run in found},
+        )
+        for spec, found in by_seed.items()
         for metric in metrics
     ]
 
@@ -87,22 +97,6 @@ def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) 
     frame = store.latest_metrics([run.id for run in runs], metrics)
     keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
     return dict(zip(keys, frame["value"].tolist(), strict=True))
-
-
-def _comparison(
-    runs: Sequence[RunRow], differs: Mapping[str, Any], metric: str, latest: Mapping[tuple[str, str], float]
-) -> Comparison:
-    first = runs[0]
-    return Comparison(
-        method=first.method,
-        environment=first.environment,
-        profile=first.profile,
-        spec_hash=first.spec_hash,
-        differs=differs,
-        metric=metric,
-        values={run.seed: latest.get((run.id, metric)) for run in runs},
-        states={run.seed: run.state for run in runs},
-    )
 
 
 def _differences(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -4,6 +4,7 @@ SQLite runs in WAL mode, so readers never wait. Writers take turns: each write t
 which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock.
 """
 
+import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,7 +28,7 @@ def connect(where: str | Path) -> Engine:
     """
     url = as_url(where)
     if url.get_backend_name() == "sqlite":
-        _prepare_path(url)
+        _create_folder(Path(str(url.database)).parent)
     try:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
@@ -35,11 +36,11 @@ def connect(where: str | Path) -> Engine:
             f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
         ) from error
     try:
-        if not _is_current(engine):
-            _upgrade(engine)
-    except DBAPIError as error:
-        engine.dispose()
-        raise explained(error.orig, describe(engine)) from error
+        with explained_errors(describe(engine)):
+            with engine.connect() as connection:
+                revision = revision_of(connection, engine)
+            if revision != REVISIONS[-1]:
+                _upgrade(engine)
     except SsmailError:
         engine.dispose()
         raise
@@ -49,23 +50,17 @@ def connect(where: str | Path) -> Engine:
 @contextmanager
 def reading(engine: Engine) -> Iterator[Connection]:
     """Yield a connection that reads one consistent state of the database; never waits for a writer."""
-    try:
-        with engine.connect() as connection:
-            yield connection
-    except DBAPIError as error:
-        raise explained(error.orig, describe(engine)) from error
+    with explained_errors(describe(engine)), engine.connect() as connection:
+        yield connection
 
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
     """Yield a connection in a write transaction. Waits for the write lock and holds it until the block ends."""
-    try:
-        with engine.connect() as connection:
-            connection = connection.execution_options(writes=True)
-            with connection.begin():
-                yield connection
-    except DBAPIError as error:
-        raise explained(error.orig, describe(engine)) from error
+    with explained_errors(describe(engine)), engine.connect() as connection:
+        connection = connection.execution_options(writes=True)
+        with connection.begin():
+            yield connection
 
 
 def describe(engine: Engine) -> str:
@@ -74,9 +69,12 @@ def describe(engine: Engine) -> str:
 
 
 def as_url(where: str | Path) -> URL:
-    """Return the URL for a path or URL, with an absolute path for SQLite. Raises InputError when it is neither."""
+    """Return the URL for a path or URL, with an absolute path for SQLite.
+
+    Raises InputError when `where` is neither, or is a folder.
+    """
     if isinstance(where, Path) or "://" not in where:
-        return URL.create("sqlite", database=str(Path(where).expanduser().absolute()))
+        return _file_url(Path(where).expanduser())
     try:
         url = make_url(where)
     except ArgumentError as error:
@@ -85,7 +83,7 @@ def as_url(where: str | Path) -> URL:
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
         raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
-    return url.set(database=str(Path(str(url.database)).absolute()))
+    return _file_url(Path(str(url.database)))
 
 
 def make_engine(url: URL) -> Engine:
@@ -127,9 +125,16 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
     return str(revision)
 
 
-def explained(error: BaseException | None, where: str) -> SsmailError:
-    """Return an exception that explains an error of the database driver in one sentence."""
-    reason = str(error)
+@contextmanager
+def explained_errors(where: str) -> Iterator[None]:
+    """Turn errors of the database driver into an SsmailError that explains them in one sentence."""
+    try:
+        yield
+    except (DBAPIError, sqlite3.Error) as error:
+        raise _explained(str(error.orig if isinstance(error, DBAPIError) else error), where) from error
+
+
+def _explained(reason: str, where: str) -> SsmailError:
     if "not a database" in reason or "malformed" in reason:
         return InputError(f"{where} is not an SQLite database, or is damaged ({reason}); give another file")
     if "unable to open" in reason or "readonly" in reason:
@@ -145,23 +150,20 @@ def _show(url: URL) -> str:
     return url.render_as_string(hide_password=True)
 
 
-def _prepare_path(url: URL) -> None:
-    path = Path(str(url.database))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot create the folder {path.parent} for the database ({error.strerror}); choose a writable place"
-        ) from error
+def _file_url(path: Path) -> URL:
+    path = path.absolute()
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
+    return URL.create("sqlite", database=str(path))
 
 
-def _is_current(engine: Engine) -> bool:
-    """Return whether the schema is the current one. Raises InputError when this ssmail cannot use the database."""
-    with engine.connect() as connection:
-        revision = revision_of(connection, engine)
-    return revision == REVISIONS[-1]
+def _create_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"cannot create the folder {folder} for the database ({error.strerror}); choose a writable place"
+        ) from error
 
 
 def _upgrade(engine: Engine) -> None:

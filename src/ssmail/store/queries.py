@@ -8,9 +8,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Connection, Select, select
+from sqlalchemy import ColumnElement, Connection, Table, func, select
 
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
@@ -124,21 +123,32 @@ def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
     return [_resolve_one(connection, prefix.strip().lower()) for prefix in prefixes]
 
 
-def metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
-    """Return every recorded value: run_id, seed, name, step, value; ordered by run start, name and step."""
-    table, run = schema.metric, schema.run
+def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[bool]) -> int:
+    """Return the number of rows of the table that meet the conditions."""
+    return int(connection.execute(select(func.count()).select_from(table).where(*conditions)).scalar_one())
+
+
+def metrics(
+    connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None, *, latest: bool = False
+) -> "pd.DataFrame":
+    """Return all recorded values, or the latest of each metric: columns run_id, seed, name, step, value.
+
+    The rows are ordered by the start of the run, name and step.
+    """
+    import pandas as pd  # imported late so that listing runs does not wait for it
+
+    table, run = schema.metric_latest if latest else schema.metric, schema.run
     query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
-    query = query.join(run, run.c.id == table.c.run_id)
+    query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
+    if names is not None:
+        query = query.where(table.c.name.in_(list(names)))
     query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
-    return _frame(connection, _selected(query, table, run_ids, names), ["run_id", "seed", "name", "step", "value"])
-
-
-def latest_metrics(connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
-    """Return the last value of each metric: run_id, name, step, value; ordered by run start and name."""
-    table, run = schema.metric_latest, schema.run
-    query = select(table.c.run_id, table.c.name, table.c.step, table.c.value, table.c.kind)
-    query = query.join(run, run.c.id == table.c.run_id).order_by(run.c.started, run.c.id, table.c.name)
-    return _frame(connection, _selected(query, table, run_ids, names), ["run_id", "name", "step", "value"])
+    columns = ["run_id", "seed", "name", "step", "value"]
+    frame = pd.DataFrame(connection.execute(query).all(), columns=[*columns, "kind"])
+    value = frame["value"].astype(float).to_numpy(copy=True)
+    for kind in ("nan", "inf", "-inf"):
+        value[(frame["kind"] == kind).to_numpy()] = float(kind)
+    return frame.assign(value=value).astype({"seed": "int64", "step": "int64"})[columns]
 
 
 def array(connection: Connection, run_id: str, name: str) -> npt.NDArray[Any]:
@@ -183,21 +193,3 @@ def _resolve_one(connection: Connection, prefix: str) -> str:
     if len(found) > 1:
         raise InputError(f"several run ids start with {prefix!r}; give more digits")
     return str(found[0])
-
-
-def _selected(query: Select[Any], table: Any, run_ids: Sequence[str], names: Sequence[str] | None) -> Select[Any]:
-    query = query.where(table.c.run_id.in_(list(run_ids)))
-    return query if names is None else query.where(table.c.name.in_(list(names)))
-
-
-def _frame(connection: Connection, query: Select[Any], columns: list[str]) -> "pd.DataFrame":
-    import pandas as pd  # imported late so that listing runs does not wait for it
-
-    rows = connection.execute(query).all()
-    frame = pd.DataFrame(rows, columns=[*columns, "kind"])
-    value = frame["value"].astype(float).to_numpy(copy=True)
-    value[(frame["kind"] == "nan").to_numpy()] = np.nan
-    value[(frame["kind"] == "inf").to_numpy()] = np.inf
-    value[(frame["kind"] == "-inf").to_numpy()] = -np.inf
-    integers = {name: "int64" for name in ("seed", "step") if name in columns}
-    return frame.assign(value=value).astype(integers)[columns]

@@ -63,9 +63,9 @@ class Store:
         state: RunState | str | None = None,
         ids: Sequence[str] | None = None,
     ) -> list[RunRow]:
-        """The runs that meet every condition given, newest last.
+        """Return the runs that meet all given conditions, newest last.
 
-        `ids` are ids or their beginnings. Raises InputError for an unknown or ambiguous id.
+        `ids` are full ids or prefixes. Raises InputError for an unknown or ambiguous id.
         """
         run = schema.run
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}
@@ -198,7 +198,7 @@ class Store:
     def latest_metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
         """Return the last value of each metric of the runs (full ids): columns run_id, name, step, value."""
         with reading(self._engine) as connection:
-            return queries.latest_metrics(connection, run_ids, names)
+            return queries.metrics(connection, run_ids, names, latest=True).drop(columns="seed")
 
     def array(self, run_id: str, name: str) -> npt.NDArray[Any]:
         """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""

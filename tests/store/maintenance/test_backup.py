@@ -10,10 +10,9 @@ import pytest
 
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store, connection
-from ssmail.store.maintenance import backup, sqlite_file
-from ssmail.store.maintenance.backup import back_up, upgrade
+from ssmail.store.maintenance import sqlite_file
 from ssmail.store.maintenance.checks import check
-from ssmail.store.maintenance.sqlite_file import RunCount, describe_contents
+from ssmail.store.maintenance.sqlite_file import RunCount, back_up, describe_contents, upgrade
 from ssmail.store.schema import REVISIONS
 from tests.store.databases import SPEC, add, change, contents, files
 
@@ -75,9 +74,9 @@ def test_a_backup_during_writes_is_one_moment(store: Store, tmp_path: Path) -> N
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ssmail.store.maintenance import backup
-backup._copy = lambda path, partial: (partial.write_bytes(b"half"), os.kill(os.getpid(), signal.SIGKILL))
-backup.back_up(sys.argv[1], Path(sys.argv[2]))
+from ssmail.store.maintenance import sqlite_file
+sqlite_file._copy_pages = lambda path, partial: (partial.write_bytes(b"half"), os.kill(os.getpid(), signal.SIGKILL))
+sqlite_file.back_up(sys.argv[1], Path(sys.argv[2]))
 """
 
 
@@ -136,7 +135,7 @@ def newer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = scripts / "versions" / "revision_9998.py"
     path.write_text(REVISION.format(before=REVISIONS[-1], then=""))
     monkeypatch.setattr(connection, "_MIGRATIONS", scripts)
-    for module in (connection, sqlite_file, backup):
+    for module in (connection, sqlite_file):
         monkeypatch.setattr(module, "REVISIONS", (*REVISIONS, "9998"))
     return path
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 from sqlalchemy.exc import DBAPIError
 
 from ssmail.config.spec import spec_hash
@@ -20,7 +20,6 @@ from ssmail.store.schema import REVISIONS, RunState
 FINAL = "test"
 """Prefix of the names of final metrics."""
 _MOST = 20  # problems reported by SQLite's integrity check
-_DATABASE = b"SQLite format 3\x00"
 
 
 @dataclass(frozen=True)
@@ -97,8 +96,8 @@ def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
 def _final_metrics(connection: Connection, run: RunRow) -> Iterator[Problem]:
     """Check that a finished run has final metrics."""
     latest = schema.metric_latest
-    query = select(func.count()).where(latest.c.run_id == run.id, latest.c.name.startswith(FINAL))
-    if run.state is RunState.FINISHED and connection.execute(query).scalar_one() == 0:
+    final = latest.c.name.startswith(FINAL)
+    if run.state is RunState.FINISHED and not queries.count_rows(connection, latest, latest.c.run_id == run.id, final):
         yield Problem("final metrics", run.id, f"run {run.name} is finished without final metrics", _again(run))
 
 
@@ -146,7 +145,8 @@ def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> 
 def _stray_folders(path: Path, folders: Sequence[Path], here: set[str]) -> Iterator[Problem]:
     """Find checkpoint folders that belong to no run of this database or of others in the same folder."""
     strays = [folder for folder in folders if folder.name not in here]
-    known = set().union(*map(_run_ids, _neighbours(path))) if strays else set()
+    neighbours = [file for file in path.parent.iterdir() if file != path and file.is_file()]
+    known = set().union(*map(_run_ids, neighbours)) if strays else set()
     for folder in strays:
         if folder.name.startswith(STAGING):
             found = f"{folder} belongs to a merge that is running or was killed"
@@ -162,19 +162,6 @@ def _checkpoint_folders(path: Path) -> list[Path]:
     root = checkpoint_root_of(path)
     named = re.compile(rf"[0-9a-f]{{32}}|{re.escape(STAGING)}.*")
     return sorted(folder for folder in root.iterdir() if named.fullmatch(folder.name)) if root.is_dir() else []
-
-
-def _neighbours(path: Path) -> list[Path]:
-    """Return the other SQLite files in the folder, which share the checkpoint folder."""
-
-    def is_sqlite(file: Path) -> bool:
-        try:
-            with file.open("rb") as content:
-                return content.read(len(_DATABASE)) == _DATABASE
-        except OSError:
-            return False
-
-    return [file for file in path.parent.iterdir() if file != path and file.is_file() and is_sqlite(file)]
 
 
 def _run_ids(path: Path) -> set[str]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Table, func, select, update
+from sqlalchemy import Connection, Table, select, update
 
 from ssmail.store import arrays, queries, schema
 from ssmail.store.connection import connect, reading, writing
@@ -103,11 +103,8 @@ def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted) 
 
 
 def _counts(there: Connection, here: Connection, runs: Sequence[RunRow]) -> dict[str, int]:
-    ids = [run.id for run in runs]
-
     def count(connection: Connection, table: Table) -> int:
-        query = select(func.count()).select_from(table).where(table.c.run_id.in_(ids))
-        return int(connection.execute(query).scalar_one())
+        return queries.count_rows(connection, table, table.c.run_id.in_([run.id for run in runs]))
 
     metrics, kept = count(here, schema.metric), count(here, schema.array)
     return {

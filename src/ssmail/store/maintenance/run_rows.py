@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from sqlalchemy import ColumnElement, Connection, Table, func, insert, select
 
 from ssmail.store import schema
-from ssmail.store.queries import RunRow
+from ssmail.store.queries import RunRow, count_rows
 
 NOT_COMPARED = ("seconds",)
 """Metrics that depend on the machine and not on the run."""
@@ -51,8 +51,8 @@ def copy_run(source: Connection, target: Connection, run_id: str) -> None:
 def amount(connection: Connection, run_id: str) -> tuple[int, ...]:
     """Return how much the run recorded, as a tuple to compare: its last step, then its rows in each table."""
     step = select(func.coalesce(func.max(schema.metric.c.step), 0)).where(schema.metric.c.run_id == run_id)
-    counts = (select(func.count()).select_from(table).where(table.c.run_id == run_id) for table in CHILDREN)
-    return tuple(int(connection.execute(query).scalar_one()) for query in (step, *counts))
+    counts = (count_rows(connection, table, table.c.run_id == run_id) for table in CHILDREN)
+    return (int(connection.execute(step).scalar_one()), *counts)
 
 
 def first_difference(here: Connection, kept: RunRow, there: Connection, other: RunRow) -> Difference | None:

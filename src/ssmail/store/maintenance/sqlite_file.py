@@ -1,17 +1,19 @@
-"""SQLite database files: finding, opening without upgrading, describing and writing them."""
+"""SQLite database files: find and open them without upgrading, describe, back up, upgrade and write them."""
 
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
-from sqlalchemy import URL, Connection, Engine, Table, func, select
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy import URL, Connection, Engine, func, select
 
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
 from ssmail.store import schema
-from ssmail.store.connection import as_url, explained, make_engine, reading, revision_of
+from ssmail.store.connection import BUSY_SECONDS, as_url, connect, explained_errors, make_engine, reading, revision_of
+from ssmail.store.queries import count_rows
 from ssmail.store.schema import REVISIONS
 
 SIDE_FILES = ("-wal", "-shm", "-journal")
@@ -50,14 +52,22 @@ class DatabaseInformation:
         return self.array_bytes / self.size_bytes if self.size_bytes else 0.0
 
 
+@dataclass(frozen=True)
+class Upgrade:
+    """What an upgrade did. `backup` is a copy of the old state; None if there was nothing to upgrade or keep."""
+
+    path: Path
+    before: str | None
+    after: str
+    backup: Path | None
+
+
 def existing(where: str | Path) -> Path:
     """Return the file of an SQLite database, given its path or URL.
 
-    Raises InputError for a server database and for a file that does not exist.
+    Raises InputError for a server database, a folder, or a file that does not exist.
     """
     path = file_of(where)
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
     if not path.exists():
         raise InputError(f"there is no database {path}; check the path, or create a database with `ssmail train`")
     return path
@@ -110,7 +120,7 @@ def new_file(target: Path) -> Iterator[Path]:
     """
     _refuse_existing(target)
     try:
-        with atomic_write(target, overwrite=False) as partial:
+        with explained_errors(str(target)), atomic_write(target, overwrite=False) as partial:
             try:
                 yield partial
             finally:
@@ -119,8 +129,6 @@ def new_file(target: Path) -> Iterator[Path]:
     except OSError as error:
         _refuse_existing(target)  # another process may have written it meanwhile
         raise InputError(f"{target} cannot be written: {error.strerror or error}; choose another place") from error
-    except DBAPIError as error:
-        raise explained(error.orig, str(target)) from error
 
 
 def _refuse_existing(target: Path) -> None:
@@ -151,15 +159,12 @@ def describe_contents(where: str | Path) -> DatabaseInformation:
 
 
 def _row_counts(connection: Connection) -> dict[str, int]:
-    def count(table: Table) -> int:
-        return int(connection.execute(select(func.count()).select_from(table)).scalar_one())
-
     sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))
     return {
-        "metrics": count(schema.metric),
-        "arrays": count(schema.array),
+        "metrics": count_rows(connection, schema.metric),
+        "arrays": count_rows(connection, schema.array),
         "array_bytes": int(connection.execute(sizes).scalar_one()),
-        "artifacts": count(schema.artifact),
+        "artifacts": count_rows(connection, schema.artifact),
     }
 
 
@@ -177,3 +182,47 @@ def _size(path: Path) -> int:
 
 def _pragma(connection: Connection, name: str) -> int:
     return int(connection.exec_driver_sql(f"PRAGMA {name}").scalar_one())
+
+
+def back_up(where: str | Path, target: Path) -> int:
+    """Copy the database to the new file `target` and return its size in bytes.
+
+    The copy is one consistent state of the database, even while runs are written, and makes no writer wait. Checkpoint
+    files are not copied. Raises InputError when `target` exists or cannot be written, or when `where` is damaged or not
+    an ssmail database.
+    """
+    path = existing(where)
+    revision(path)
+    with new_file(target.absolute()) as partial, explained_errors(str(path)):
+        _copy_pages(path, partial)
+    return target.stat().st_size
+
+
+def upgrade(where: str | Path) -> Upgrade:
+    """Back up the database beside the file, then upgrade it to the newest schema in one transaction.
+
+    Raises InputError, and changes nothing, when ssmail cannot use the file.
+    """
+    path = existing(where)
+    before = revision(path)
+    backup = None
+    if before is not None and before != REVISIONS[-1]:
+        backup = path.with_name(f"{path.stem}-schema-{before}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}{path.suffix}")
+        back_up(path, backup)
+    connect(path).dispose()
+    return Upgrade(path, before, REVISIONS[-1], backup)
+
+
+def _copy_pages(path: Path, partial: Path) -> None:
+    """Copy all pages in one read transaction, and check that the copy is intact."""
+    source = sqlite3.connect(path, timeout=BUSY_SECONDS)
+    copy = sqlite3.connect(partial)
+    try:
+        source.backup(copy, pages=-1)
+        damage = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
+        copy.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    finally:
+        copy.close()
+        source.close()
+    if damage != "ok":
+        raise InputError(f"{path} is damaged ({damage}) and was not copied; run `ssmail db check` for details")

@@ -8,6 +8,11 @@ down_revision = None
 
 
 def upgrade() -> None:
+    _create_run()
+    _create_children()
+
+
+def _create_run() -> None:
     op.create_table(
         "run",
         sa.Column("id", sa.String(32), primary_key=True),
@@ -36,6 +41,9 @@ def upgrade() -> None:
         sa.Column("peak_memory_bytes", sa.BigInteger),
     )
     op.create_index("run_cell", "run", ["spec_hash", "seed"])
+
+
+def _create_children() -> None:
     op.create_table(
         "metric",
         _run_id(),
