@@ -24,7 +24,7 @@ class FigureRecord(Protocol):
 
     @property
     def provenance(self) -> "Provenance":
-        """The runs that the figure is drawn from."""
+        """The runs that the figure is drawn from, the names of their curves, and the options of `collect`."""
         ...
 
     @property
