@@ -9,6 +9,7 @@ training split, and the SHA-256 of its `sources`. Nothing is pickled.
 import json
 import zipfile
 from collections.abc import Callable, Mapping
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -167,7 +168,7 @@ def _read_letters(file: _File) -> ExpertSet:
         positions, velocities, _ = file.motion(split, (getattr(params, split), params.steps, len(params.word), 2))
         splits[split] = Trajectories.single_mode(positions, velocities)
     lines = file.array("centre_lines", (len(params.word), letters.POINTS, 2), np.float64)
-    return letters.bundle(splits, lines, params)
+    return ExpertSet.bundle(splits, lines, {"environment": "letters", **params.model_dump(mode="json")})
 
 
 def _read_mocap(file: _File) -> ExpertSet:
@@ -182,7 +183,8 @@ def _read_mocap(file: _File) -> ExpertSet:
         positions, velocities, _ = file.motion(split, (windows, params.window_of(split), count, 3))
         cut = (file.array(f"{split}/{name}", (windows,), np.int64) for name in ("trial", "frame"))
         splits[split] = Trajectories.single_mode(positions, velocities, *cut)
-    experts = mocap.bundle(splits, params, tuple(joints.tolist()), tuple(parents.tolist()), sources)
+    skeleton = tuple(joints.tolist()), tuple(parents.tolist())
+    experts = ExpertSet.bundle(splits, mocap.NO_LINES, params.model_dump(mode="json"), *skeleton, sources)
     stored = file.array("scaling", (4,), np.float64)
     if experts.hash == str(file.contents["hash"]) and not np.array_equal(stored, _mocap_arrays(experts)["scaling"]):
         raise file.fault(f"the scaling in {file.path} is not that of its training split")
@@ -190,12 +192,10 @@ def _read_mocap(file: _File) -> ExpertSet:
 
 
 def _mocap_arrays(experts: ExpertSet) -> dict[str, Any]:
-    scaling = experts.scaling
-    ranges = (scaling.position_min, scaling.position_max, scaling.velocity_min, scaling.velocity_max)
     return {
         "joints": np.array(experts.joints),
         "parents": np.array(experts.parents),
-        "scaling": np.array(ranges),
+        "scaling": np.array(astuple(experts.scaling)),
         "sources": np.array(json.dumps(dict(experts.sources))),
     }
 

@@ -16,7 +16,7 @@ not stop.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from itertools import pairwise
@@ -46,12 +46,8 @@ TEMPO = 0.6  # durations of parts grow as their effort to this power: longer one
 
 def generate(params: LettersSpec) -> ExpertSet:
     """Generate the expert set; equal parameters yield equal arrays."""
-    return bundle(generate_splits(params, partial(_generate_split, params)), letter_lines(params), params)
-
-
-def bundle(splits: Mapping[str, Trajectories], letters: Floats, params: LettersSpec) -> ExpertSet:
-    """Put the splits together with the polylines of the letters (N, P', 2)."""
-    return ExpertSet.bundle(splits, letters, {"environment": "letters", **params.model_dump(mode="json")})
+    splits = generate_splits(params, partial(_generate_split, params))
+    return ExpertSet.bundle(splits, letter_lines(params), {"environment": "letters", **params.model_dump(mode="json")})
 
 
 @cache

@@ -89,7 +89,13 @@ def spec_differences(runs: Sequence[RunRow]) -> dict[str, dict[str, Any]]:
     kinds: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for run in runs:
         kinds.setdefault((run.method, run.environment), {})[run.spec_hash] = run.spec
-    return {spec: keys for alike in kinds.values() for spec, keys in _differences(alike).items()}
+    differences: dict[str, dict[str, Any]] = {}
+    for alike in kinds.values():
+        flat = {spec: flatten(values) for spec, values in alike.items()}
+        keys = sorted({key for values in flat.values() for key in values} - {"method", "environment", "profile"})
+        varying = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1]
+        differences |= {spec: {key: values.get(key) for key in varying} for spec, values in flat.items()}
+    return differences
 
 
 def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> dict[tuple[str, str], float]:
@@ -97,11 +103,3 @@ def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) 
     frame = store.latest_metrics([run.id for run in runs], metrics)
     keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
     return dict(zip(keys, frame["value"].tolist(), strict=True))
-
-
-def _differences(specs: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return, for each spec, the values of the dotted keys that are not the same in all specs."""
-    flat = {name: flatten(spec) for name, spec in specs.items()}
-    keys = sorted({key for values in flat.values() for key in values} - {"method", "environment", "profile"})
-    varying = [key for key in keys if len({repr(values.get(key)) for values in flat.values()}) > 1]
-    return {name: {key: values.get(key) for key in varying} for name, values in flat.items()}

@@ -7,7 +7,7 @@ which waits up to BUSY_SECONDS for the write lock, so that no later statement of
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,13 @@ def connect(where: str | Path) -> Engine:
     """
     url = as_url(where)
     if url.get_backend_name() == "sqlite":
-        _create_folder(Path(str(url.database)).parent)
+        folder = Path(str(url.database)).parent
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"cannot create the folder {folder} for the database ({error.strerror}); choose a writable place"
+            ) from error
     try:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
@@ -157,15 +163,6 @@ def _file_url(path: Path) -> URL:
     return URL.create("sqlite", database=str(path))
 
 
-def _create_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"cannot create the folder {folder} for the database ({error.strerror}); choose a writable place"
-        ) from error
-
-
 def _upgrade(engine: Engine) -> None:
     from alembic import command  # imported late: most databases need no upgrade
     from alembic.config import Config
@@ -183,8 +180,7 @@ def _upgrade(engine: Engine) -> None:
 def _use_wal(engine: Engine) -> None:
     """Switch the file to WAL mode permanently. SQLite does not wait for locks here, hence the loop."""
     deadline = time.monotonic() + BUSY_SECONDS
-    connection = engine.raw_connection()
-    try:
+    with closing(engine.raw_connection()) as connection:
         while True:
             try:
                 connection.cursor().execute("PRAGMA journal_mode = WAL")
@@ -193,5 +189,3 @@ def _use_wal(engine: Engine) -> None:
                 if "locked" not in str(error) or time.monotonic() > deadline:
                     raise DBAPIError("PRAGMA journal_mode = WAL", None, error) from error
                 time.sleep(0.01)
-    finally:
-        connection.close()

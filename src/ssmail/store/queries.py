@@ -1,24 +1,19 @@
-"""Queries on an open connection: runs, metrics as data frames, arrays, artifacts."""
+"""Rows of runs and artifacts, and the queries on an open connection that the Store shares with maintenance."""
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy.typing as npt
 from sqlalchemy import ColumnElement, Connection, Table, func, select
 
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
-from ssmail.store import arrays, schema
+from ssmail.store import schema
 from ssmail.store.schema import RunState
-
-if TYPE_CHECKING:
-    import pandas as pd
-
 
 HEARTBEAT_SECONDS = 5.0
 """Interval at which a running run records a heartbeat."""
@@ -95,7 +90,8 @@ class ArtifactRow:
 def runs(connection: Connection, *conditions: Any) -> list[RunRow]:
     """Return the runs that meet all conditions, newest last."""
     query = select(schema.run).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
-    return [_run_row(row) for row in connection.execute(query).mappings()]
+    rows = connection.execute(query).mappings()
+    return [RunRow(**{**row, "state": RunState(row["state"])}) for row in rows]
 
 
 def one_run(connection: Connection, run_id: str) -> RunRow:
@@ -120,7 +116,17 @@ def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow 
 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
     """Return the full id for each id or prefix of one. Raises InputError for an unknown or ambiguous prefix."""
-    return [_resolve_one(connection, prefix.strip().lower()) for prefix in prefixes]
+    ids = schema.run.c.id
+    full = []
+    for prefix in (prefix.strip().lower() for prefix in prefixes):
+        query = select(ids).where(ids.startswith(prefix, autoescape=True)).limit(2)
+        found = list(connection.execute(query).scalars()) if prefix else []
+        if not found:
+            raise InputError(f"no run id starts with {prefix!r}; `ssmail runs list` shows the stored runs")
+        if len(found) > 1:
+            raise InputError(f"several run ids start with {prefix!r}; give more digits")
+        full += found
+    return full
 
 
 def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[bool]) -> int:
@@ -128,68 +134,8 @@ def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[
     return int(connection.execute(select(func.count()).select_from(table).where(*conditions)).scalar_one())
 
 
-def metrics(
-    connection: Connection, run_ids: Sequence[str], names: Sequence[str] | None, *, latest: bool = False
-) -> "pd.DataFrame":
-    """Return all recorded values, or the latest of each metric: columns run_id, seed, name, step, value.
-
-    The rows are ordered by the start of the run, name and step.
-    """
-    import pandas as pd  # imported late so that listing runs does not wait for it
-
-    table, run = schema.metric_latest if latest else schema.metric, schema.run
-    query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
-    query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
-    if names is not None:
-        query = query.where(table.c.name.in_(list(names)))
-    query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
-    columns = ["run_id", "seed", "name", "step", "value"]
-    frame = pd.DataFrame(connection.execute(query).all(), columns=[*columns, "kind"])
-    value = frame["value"].astype(float).to_numpy(copy=True)
-    for kind in ("nan", "inf", "-inf"):
-        value[(frame["kind"] == kind).to_numpy()] = float(kind)
-    return frame.assign(value=value).astype({"seed": "int64", "step": "int64"})[columns]
-
-
-def array(connection: Connection, run_id: str, name: str) -> npt.NDArray[Any]:
-    """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""
-    table = schema.array
-    query = select(table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run_id, table.c.name == name)
-    row = connection.execute(query).one_or_none()
-    if row is None:
-        existing = ", ".join(array_names(connection, run_id)) or "none"
-        raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {existing}")
-    return arrays.decode(row.dtype, row.shape, row.data)
-
-
-def array_names(connection: Connection, run_id: str) -> list[str]:
-    """Return the names of the run's arrays, sorted."""
-    table = schema.array
-    query = select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)
-    return list(connection.execute(query).scalars())
-
-
 def artifacts(connection: Connection, run_id: str, root: Path) -> list[ArtifactRow]:
     """Return the run's files, by name; relative paths are resolved against `root`."""
     table = schema.artifact
     query = select(table).where(table.c.run_id == run_id).order_by(table.c.name)
-    return [
-        ArtifactRow(row["run_id"], row["name"], root / row["path"], row["sha256"], row["size_bytes"])
-        for row in connection.execute(query).mappings()
-    ]
-
-
-def _run_row(row: Any) -> RunRow:
-    values = {item.name: row[item.name] for item in fields(RunRow)}
-    return RunRow(**{**values, "state": RunState(values["state"])})
-
-
-def _resolve_one(connection: Connection, prefix: str) -> str:
-    run = schema.run
-    query = select(run.c.id).where(run.c.id.startswith(prefix, autoescape=True)).limit(2)
-    found = list(connection.execute(query).scalars()) if prefix else []
-    if not found:
-        raise InputError(f"no run id starts with {prefix!r}; `ssmail runs list` shows the stored runs")
-    if len(found) > 1:
-        raise InputError(f"several run ids start with {prefix!r}; give more digits")
-    return str(found[0])
+    return [ArtifactRow(**{**row, "path": root / row["path"]}) for row in connection.execute(query).mappings()]

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Engine, delete, func, insert, select, update
+from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
-from ssmail.store import queries, run_metadata, schema
+from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import checkpoint_root_of
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
@@ -200,24 +200,51 @@ class Store:
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
     def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
-        """Return every metric value of the runs (full ids): columns run_id, seed, name, step, value."""
-        with reading(self._engine) as connection:
-            return queries.metrics(connection, run_ids, names)
+        """Return every metric value of the runs (full ids): columns run_id, seed, name, step, value.
+
+        The rows are ordered by the start of the run, name and step.
+        """
+        return self._metrics(schema.metric, run_ids, names)
 
     def latest_metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
         """Return the last value of each metric of the runs (full ids): columns run_id, name, step, value."""
+        return self._metrics(schema.metric_latest, run_ids, names).drop(columns="seed")
+
+    def _metrics(self, table: Table, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
+        import pandas as pd  # imported late so that listing runs does not wait for it
+
+        run = schema.run
+        query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
+        query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
+        if names is not None:
+            query = query.where(table.c.name.in_(list(names)))
+        query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
+        columns = ["run_id", "seed", "name", "step", "value"]
         with reading(self._engine) as connection:
-            return queries.metrics(connection, run_ids, names, latest=True).drop(columns="seed")
+            frame = pd.DataFrame(connection.execute(query).all(), columns=[*columns, "kind"])
+        value = frame["value"].astype(float).to_numpy(copy=True)
+        for kind in ("nan", "inf", "-inf"):
+            value[(frame["kind"] == kind).to_numpy()] = float(kind)
+        return frame.assign(value=value).astype({"seed": "int64", "step": "int64"})[columns]
 
     def array(self, run_id: str, name: str) -> npt.NDArray[Any]:
         """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""
+        table = schema.array
+        query = select(table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run_id, table.c.name == name)
         with reading(self._engine) as connection:
-            return queries.array(connection, run_id, name)
+            row = connection.execute(query).one_or_none()
+        if row is None:
+            existing = ", ".join(self.array_names(run_id)) or "none"
+            raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {existing}")
+        return arrays.decode(*row)
 
     def array_names(self, run_id: str) -> list[str]:
         """Return the names of the run's arrays, sorted."""
+        names = schema.array.c.name
         with reading(self._engine) as connection:
-            return queries.array_names(connection, run_id)
+            return list(
+                connection.execute(select(names).where(schema.array.c.run_id == run_id).order_by(names)).scalars()
+            )
 
     def artifacts(self, run_id: str) -> list[ArtifactRow]:
         """Return the files that the run recorded, by name."""

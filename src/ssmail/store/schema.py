@@ -4,21 +4,7 @@ from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Column,
-    DateTime,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    String,
-    Table,
-    Text,
-)
+import sqlalchemy as sa
 from sqlalchemy.types import TypeDecorator
 
 REVISIONS = ("0001",)
@@ -47,7 +33,7 @@ class RunState(StrEnum):
 class UtcDateTime(TypeDecorator[datetime]):
     """A time in UTC, stored without a time zone but read and written with one."""
 
-    impl = DateTime
+    impl = sa.DateTime
     cache_ok = True
 
     def process_bind_param(self, value: datetime | None, dialect: Any) -> datetime | None:
@@ -59,81 +45,81 @@ class UtcDateTime(TypeDecorator[datetime]):
         return None if value is None else value.replace(tzinfo=UTC)
 
 
-metadata = MetaData()
+metadata = sa.MetaData()
 
-run = Table(
+run = sa.Table(
     "run",
     metadata,
-    Column("id", String(32), primary_key=True),
-    Column("method", String(64), nullable=False),
-    Column("environment", String(64), nullable=False),
-    Column("profile", String(64), nullable=False),
-    Column("seed", BigInteger, nullable=False),
-    Column("spec_json", Text, nullable=False),
-    Column("spec_hash", String(16), nullable=False),
-    Column("dataset_hash", String(64)),
-    Column("state", String(16), nullable=False),
-    Column("error", Text),
-    Column("started", UtcDateTime, nullable=False),
-    Column("finished", UtcDateTime),
-    Column("heartbeat", UtcDateTime, nullable=False),
-    Column("owner", String(32), nullable=False),
-    Column("resumes", Integer, nullable=False),
-    Column("git_commit", String(40)),
-    Column("git_dirty", Boolean),
-    Column("package_version", String(64), nullable=False),
-    Column("torch_version", String(64), nullable=False),
-    Column("device", String(64), nullable=False),
-    Column("host", String(255), nullable=False),
-    Column("wall_seconds", Float, nullable=False),
-    Column("cpu_seconds", Float, nullable=False),
-    Column("peak_memory_bytes", BigInteger),
-    Index("run_cell", "spec_hash", "seed"),
+    sa.Column("id", sa.String(32), primary_key=True),
+    sa.Column("method", sa.String(64), nullable=False),
+    sa.Column("environment", sa.String(64), nullable=False),
+    sa.Column("profile", sa.String(64), nullable=False),
+    sa.Column("seed", sa.BigInteger, nullable=False),
+    sa.Column("spec_json", sa.Text, nullable=False),
+    sa.Column("spec_hash", sa.String(16), nullable=False),
+    sa.Column("dataset_hash", sa.String(64)),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("error", sa.Text),
+    sa.Column("started", UtcDateTime, nullable=False),
+    sa.Column("finished", UtcDateTime),
+    sa.Column("heartbeat", UtcDateTime, nullable=False),
+    sa.Column("owner", sa.String(32), nullable=False),
+    sa.Column("resumes", sa.Integer, nullable=False),
+    sa.Column("git_commit", sa.String(40)),
+    sa.Column("git_dirty", sa.Boolean),
+    sa.Column("package_version", sa.String(64), nullable=False),
+    sa.Column("torch_version", sa.String(64), nullable=False),
+    sa.Column("device", sa.String(64), nullable=False),
+    sa.Column("host", sa.String(255), nullable=False),
+    sa.Column("wall_seconds", sa.Float, nullable=False),
+    sa.Column("cpu_seconds", sa.Float, nullable=False),
+    sa.Column("peak_memory_bytes", sa.BigInteger),
+    sa.Index("run_cell", "spec_hash", "seed"),
 )
 
 
-def _run_id() -> Column[str]:
-    return Column("run_id", String(32), ForeignKey("run.id", ondelete="CASCADE"), primary_key=True)
+def _run_id() -> sa.Column[str]:
+    return sa.Column("run_id", sa.String(32), sa.ForeignKey("run.id", ondelete="CASCADE"), primary_key=True)
 
 
-metric = Table(
+metric = sa.Table(
     "metric",
     metadata,
     _run_id(),
-    Column("name", String(128), primary_key=True),
-    Column("step", Integer, primary_key=True, autoincrement=False),
-    Column("value", Float(53)),
-    Column("kind", String(8), nullable=False),
+    sa.Column("name", sa.String(128), primary_key=True),
+    sa.Column("step", sa.Integer, primary_key=True, autoincrement=False),
+    sa.Column("value", sa.Float(53)),
+    sa.Column("kind", sa.String(8), nullable=False),
     sqlite_with_rowid=False,
 )
 
-metric_latest = Table(
+metric_latest = sa.Table(
     "metric_latest",
     metadata,
     _run_id(),
-    Column("name", String(128), primary_key=True),
-    Column("step", Integer, nullable=False),
-    Column("value", Float(53)),
-    Column("kind", String(8), nullable=False),
+    sa.Column("name", sa.String(128), primary_key=True),
+    sa.Column("step", sa.Integer, nullable=False),
+    sa.Column("value", sa.Float(53)),
+    sa.Column("kind", sa.String(8), nullable=False),
     sqlite_with_rowid=False,
 )
 
-array = Table(
+array = sa.Table(
     "array",
     metadata,
     _run_id(),
-    Column("name", String(128), primary_key=True),
-    Column("dtype", String(16), nullable=False),
-    Column("shape", String(255), nullable=False),
-    Column("data", LargeBinary, nullable=False),
+    sa.Column("name", sa.String(128), primary_key=True),
+    sa.Column("dtype", sa.String(16), nullable=False),
+    sa.Column("shape", sa.String(255), nullable=False),
+    sa.Column("data", sa.LargeBinary, nullable=False),
 )
 
-artifact = Table(
+artifact = sa.Table(
     "artifact",
     metadata,
     _run_id(),
-    Column("name", String(128), primary_key=True),
-    Column("path", Text, nullable=False),
-    Column("sha256", String(64), nullable=False),
-    Column("size_bytes", BigInteger, nullable=False),
+    sa.Column("name", sa.String(128), primary_key=True),
+    sa.Column("path", sa.Text, nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    sa.Column("size_bytes", sa.BigInteger, nullable=False),
 )

@@ -14,6 +14,7 @@ kept so that an error in a number can still name its line.
 """
 
 import itertools
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -159,10 +160,8 @@ class _Reader:
         """Convert a channel to numbers (F, width). Raises InputError for the first word that is not a valid number."""
         values = np.empty(0)
         if "_" not in "".join(channel.words):  # which float() would take for a separator
-            try:
+            with suppress(ValueError):
                 values = np.array(list(map(float, channel.words)))
-            except ValueError:
-                values = np.empty(0)
         if len(values) == 0 or not (np.abs(values) <= LARGEST).all():
             for index, word in enumerate(channel.words):
                 number(self.line(channel.lines[index // channel.width]), word)

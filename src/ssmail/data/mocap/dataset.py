@@ -27,6 +27,7 @@ from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 
 MOST_TRIALS = 1000
+NO_LINES = np.empty((0, 0, 3))  # the centre lines of recorded motion
 Trial = Annotated[int, Field(ge=1, lt=1_000_000)]
 Trials = Annotated[tuple[Trial, ...], Field(min_length=1)]
 
@@ -98,23 +99,14 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
             names = {trial: subject.trials[trial] for trial in trials}
             splits[split] = _split(files, names, skeleton, wanted.window_of(split), sources)
     made = wanted.model_copy(update={**used, "missing": missing, "length_unit": skeleton.length_unit})
-    experts = bundle(splits, made, skeleton.joints, skeleton.parents, sources)
+    experts = ExpertSet.bundle(
+        splits, NO_LINES, made.model_dump(mode="json"), skeleton.joints, skeleton.parents, sources
+    )
     try:
         _ = experts.scaling
     except ValueError:
         raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
     return experts
-
-
-def bundle(
-    splits: Mapping[str, Trajectories],
-    params: MocapParameters,
-    joints: tuple[str, ...],
-    parents: tuple[int, ...],
-    sources: Mapping[str, str],
-) -> ExpertSet:
-    """Put the splits together with the skeleton and the SHA-256 of the source files."""
-    return ExpertSet.bundle(splits, np.empty((0, 0, 3)), params.model_dump(mode="json"), joints, parents, sources)
 
 
 def _check_trials(wanted: MocapParameters) -> None:

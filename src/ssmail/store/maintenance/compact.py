@@ -2,6 +2,7 @@
 
 import sqlite3
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy.typing as npt
 from sqlalchemy import Connection, Table, select, update
 
+from ssmail.errors import InputError
 from ssmail.store import arrays, queries, schema
 from ssmail.store.connection import connect, reading, writing
 from ssmail.store.maintenance.run_rows import copy_rows
@@ -62,14 +64,11 @@ def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], want
     source = existing(where)
     require_current(source)
     with new_file(target.absolute()) as partial:
-        engine = connect(partial)
-        try:
-            with opened(source) as theirs, reading(theirs) as there, writing(engine) as here:
-                for run in runs:
-                    _copy_run(there, here, run, wanted)
-                report = _counts(there, here, runs)
-        finally:
-            engine.dispose()
+        connect(partial).dispose()  # creates the tables
+        with opened(source) as theirs, opened(partial) as ours, reading(theirs) as there, writing(ours) as here:
+            for run in runs:
+                _copy_run(there, here, run, wanted)
+            report = _counts(there, here, runs)
         _shrink(partial)
         size = partial.stat().st_size
     thinned = sum(thin is not None for run in runs for thin in wanted.arrays.get(run.id, {}).values())
@@ -78,12 +77,9 @@ def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], want
 
 def _shrink(path: Path) -> None:
     """Free unused pages and leave WAL mode."""
-    connection = sqlite3.connect(path, isolation_level=None)
-    try:
+    with closing(sqlite3.connect(path, isolation_level=None)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         connection.execute("VACUUM")
-    finally:
-        connection.close()
 
 
 def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted) -> None:
@@ -96,10 +92,13 @@ def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted) 
     copy_rows(there, here, metric, metric.c.run_id == run.id, kept)
     copy_rows(there, here, latest, latest.c.run_id == run.id)
     for name, thin in wanted.arrays.get(run.id, {}).items():
-        copy_rows(there, here, array, array.c.run_id == run.id, array.c.name == name)
+        this = (array.c.run_id == run.id) & (array.c.name == name)
+        copy_rows(there, here, array, this)
         if thin is not None:
-            thinned = arrays.encode(thin(queries.array(there, run.id, name)))
-            here.execute(update(array).where(array.c.run_id == run.id, array.c.name == name).values(**thinned))
+            row = here.execute(select(array.c.dtype, array.c.shape, array.c.data).where(this)).one_or_none()
+            if row is None:
+                raise InputError(f"run {run.name} has no array {name!r}")
+            here.execute(update(array).where(this).values(**arrays.encode(thin(arrays.decode(*row)))))
 
 
 def _counts(there: Connection, here: Connection, runs: Sequence[RunRow]) -> dict[str, int]:

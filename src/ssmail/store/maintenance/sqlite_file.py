@@ -2,12 +2,12 @@
 
 import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sqlalchemy import URL, Connection, Engine, func, select
+from sqlalchemy import URL, Engine, func, select
 
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError
@@ -40,11 +40,11 @@ class DatabaseInformation:
     newest_revision: str
     size_bytes: int
     free_bytes: int
-    metrics: int  # rows
-    arrays: int  # rows
-    array_bytes: int  # as compressed
-    artifacts: int  # rows
-    runs: tuple[RunCount, ...]
+    metrics: int = 0  # rows
+    arrays: int = 0  # rows
+    array_bytes: int = 0  # as compressed
+    artifacts: int = 0  # rows
+    runs: tuple[RunCount, ...] = ()
 
     @property
     def array_share(self) -> float:
@@ -143,45 +143,28 @@ def describe_contents(where: str | Path) -> DatabaseInformation:
     """
     path = existing(where)
     found = revision(path)
-    with opened(path) as engine, reading(engine) as connection:
-        rows = (
-            {"metrics": 0, "arrays": 0, "array_bytes": 0, "artifacts": 0} if found is None else _row_counts(connection)
-        )
-        return DatabaseInformation(
-            path=path,
-            revision=found,
-            newest_revision=REVISIONS[-1],
-            size_bytes=_size(path),
-            free_bytes=_pragma(connection, "freelist_count") * _pragma(connection, "page_size"),
-            runs=() if found is None else _run_counts(connection),
-            **rows,
-        )
-
-
-def _row_counts(connection: Connection) -> dict[str, int]:
-    sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))
-    return {
-        "metrics": count_rows(connection, schema.metric),
-        "arrays": count_rows(connection, schema.array),
-        "array_bytes": int(connection.execute(sizes).scalar_one()),
-        "artifacts": count_rows(connection, schema.artifact),
-    }
-
-
-def _run_counts(connection: Connection) -> tuple[RunCount, ...]:
-    run = schema.run
+    log, run = path.with_name(path.name + "-wal"), schema.run
+    size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
+    free_pages = "SELECT freelist_count * page_size FROM pragma_freelist_count, pragma_page_size"
+    array_sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))
     columns = (run.c.environment, run.c.method, run.c.profile, run.c.state)
-    query = select(*columns, func.count()).group_by(*columns).order_by(*columns)
-    return tuple(RunCount(*row) for row in connection.execute(query))
-
-
-def _size(path: Path) -> int:
-    log = path.with_name(path.name + "-wal")
-    return path.stat().st_size + (log.stat().st_size if log.exists() else 0)
-
-
-def _pragma(connection: Connection, name: str) -> int:
-    return int(connection.exec_driver_sql(f"PRAGMA {name}").scalar_one())
+    runs = select(*columns, func.count()).group_by(*columns).order_by(*columns)
+    with opened(path) as engine, reading(engine) as connection:
+        free = int(connection.exec_driver_sql(free_pages).scalar_one())
+        if found is None:
+            return DatabaseInformation(path, found, REVISIONS[-1], size, free)
+        return DatabaseInformation(
+            path,
+            found,
+            REVISIONS[-1],
+            size,
+            free,
+            metrics=count_rows(connection, schema.metric),
+            arrays=count_rows(connection, schema.array),
+            array_bytes=int(connection.execute(array_sizes).scalar_one()),
+            artifacts=count_rows(connection, schema.artifact),
+            runs=tuple(RunCount(*row) for row in connection.execute(runs)),
+        )
 
 
 def back_up(where: str | Path, target: Path) -> int:
@@ -215,14 +198,9 @@ def upgrade(where: str | Path) -> Upgrade:
 
 def _copy_pages(path: Path, partial: Path) -> None:
     """Copy all pages in one read transaction, and check that the copy is intact."""
-    source = sqlite3.connect(path, timeout=BUSY_SECONDS)
-    copy = sqlite3.connect(partial)
-    try:
+    with closing(sqlite3.connect(path, timeout=BUSY_SECONDS)) as source, closing(sqlite3.connect(partial)) as copy:
         source.backup(copy, pages=-1)
         damage = copy.execute("PRAGMA quick_check(1)").fetchone()[0]
         copy.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    finally:
-        copy.close()
-        source.close()
     if damage != "ok":
         raise InputError(f"{path} is damaged ({damage}) and was not copied; run `ssmail db check` for details")
