@@ -94,7 +94,7 @@ def _write_pages(app: Sphinx) -> None:
 
 
 def _read_docstring(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """Turn a docstring's plain text with `code` into reStructuredText, in which single backticks mean something else."""
+    """Turn a docstring's plain text with `code` into reStructuredText, where backticks differ."""
     parts = re.split(r"(`[^`]+`)", "\n".join(lines))
     text = "".join(
         f"`{part}`" if part.startswith("`") else re.sub(r"([*|\\]|(?<=\w)_(?!\w))", r"\\\1", part) for part in parts

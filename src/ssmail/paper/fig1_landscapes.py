@@ -139,7 +139,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
         ideal=landscape_grids.normalised(_ideal(first.landscape)),
         shown=tuple(shown),
         measured=measured,
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=(*selection.notes, *_notes(measured, shown)),
     )
 

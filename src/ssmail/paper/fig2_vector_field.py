@@ -155,7 +155,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
         fields=fields,
         measured=measured,
         spacing=landscape_grids.read(store, first, landscape_grids.stored_epochs(store, first)[0]).plane.spacing,
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=(*selection.notes, *_notes(measured, fields)),
     )
 

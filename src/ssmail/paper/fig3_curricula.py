@@ -89,7 +89,7 @@ def collect(
         bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
         expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
         statistic=statistic,
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=selection.notes,
     )
 

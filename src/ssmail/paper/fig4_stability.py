@@ -29,8 +29,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.constant_velocity import REFERENCE, constant_velocity
-from ssmail.plots.curves import Band, band, check_recorded
+from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.series import select
 from ssmail.store import Store
@@ -95,7 +94,7 @@ def collect(
         bands=bands,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, *curve_notes.of_errors(bands)),
     )
 

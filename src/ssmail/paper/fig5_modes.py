@@ -118,7 +118,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
         panels=panels,
         expert=expert,
         frame=_frame(expert, [panel.rollouts for panel in panels if panel.rollouts is not None]),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=selection.notes,
     )
 

@@ -30,7 +30,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
-from ssmail.plots.constant_velocity import constant_velocity
+from ssmail.plots.curves import constant_velocity
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, check_settled
 from ssmail.plots.series import figure_ablation, select
@@ -121,7 +121,12 @@ def collect(
         columns=columns,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(
+            NAME,
+            selection.runs,
+            curves={run.id: f"beta {group.value}" for group in selection.groups for run in group.runs},
+            options={"statistic": statistic},
+        ),
         notes=(*selection.notes, *_notes(columns)),
     )
 

@@ -42,8 +42,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.constant_velocity import REFERENCE
-from ssmail.plots.curves import Band, Curve, band
+from ssmail.plots.curves import REFERENCE, Band, Curve, band
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection, check_settled
 from ssmail.plots.series import select
@@ -174,7 +173,7 @@ def collect(
         panels=panels,
         noise=forecast["noise"],
         statistic=statistic,
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, noise, *(text for panel in panels for text in _panel_notes(panel))),
     )
 

@@ -35,8 +35,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.constant_velocity import constant_velocity
-from ssmail.plots.curves import Band, band, check_recorded
+from ssmail.plots.curves import Band, band, check_recorded, constant_velocity
 from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
@@ -111,7 +110,7 @@ def collect(
         losses=losses,
         statistic=statistic,
         constant_velocity=constant_velocity(store, selection.runs, kind),
-        provenance=Provenance.of(NAME, selection.runs),
+        provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, which, *curve_notes.of_errors(errors)),
     )
 

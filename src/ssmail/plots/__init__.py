@@ -24,7 +24,7 @@ class FigureRecord(Protocol):
 
     @property
     def provenance(self) -> "Provenance":
-        """The runs that the figure is drawn from."""
+        """The runs that the figure is drawn from, the names of their curves, and the options of `collect`."""
         ...
 
     @property
@@ -33,5 +33,5 @@ class FigureRecord(Protocol):
         ...
 
     def table(self) -> "pd.DataFrame":
-        """Exactly what is shown, one row for each point. The column before `run_id` says what its curve is called."""
+        """Exactly what is shown, one row for each point."""
         ...

@@ -12,24 +12,23 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
+from ssmail.data.trajectories import Floats, Integers
 from ssmail.errors import InputError
 from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.plots import style
+from ssmail.plots.formatting import counted
 from ssmail.plots.metric_units import is_error
 from ssmail.plots.run_groups import Group
-from ssmail.store import RunRow, RunState
+from ssmail.store import RunRow, RunState, Store
 
 CEILING = DIVERGED**2  # squared scaled units: where a scale of errors ends
+REFERENCE = "test_constant_velocity"  # what driving straight on costs: prefix of the stored test errors
 COLUMNS = ("kind", "label", "run_id", "seed", "epoch", "value", "low", "high")
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +201,8 @@ def _draw_end(axes: Axes, curve: Curve, stroke: style.Stroke, upwards: bool) -> 
 
 def count_label(shown: Band) -> str:
     """ "gail: 5 runs, 1 diverged (x)"."""
-    count = len(shown.curves)
     fate = f", {shown.diverged} diverged (x)" if shown.diverged else ""
-    return f"{shown.label}: {count} run{'s' * (count != 1)}{fate}"
+    return f"{shown.label}: {counted(len(shown.curves), 'run')}{fate}"
 
 
 def legend_title(statistic: Statistic) -> str:
@@ -223,3 +221,12 @@ def linear_limits(bands: Sequence[Band]) -> tuple[float, float]:
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
     return low - margin, high + margin
+
+
+def constant_velocity(store: Store, runs: Sequence[RunRow], error: str = "mode_mse") -> float | None:
+    """Return the median test error of constant velocity over the runs, in squared scaled units; None without any.
+
+    Every run that finished stores it, and those on one data set agree.
+    """
+    errors = store.latest_metrics([run.id for run in runs], [f"{REFERENCE}/{error}"])["value"]
+    return float(errors.median()) if len(errors) else None

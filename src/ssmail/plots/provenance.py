@@ -57,8 +57,20 @@ class Provenance:
     csv_sha256: str | None = None  # of the CSV that was written with the figure
 
     @classmethod
-    def of(cls, figure: str, runs: Sequence[RunRow]) -> Self:
-        """The provenance of a figure drawn from these runs."""
+    def of(
+        cls,
+        figure: str,
+        runs: Sequence[RunRow],
+        *,
+        curves: Mapping[str, str] | None = None,
+        options: Mapping[str, Any] | None = None,
+    ) -> Self:
+        """Return the provenance of a figure drawn from these runs.
+
+        `curves` names, by run id, the curve that a run is drawn in; without a name it is the run's method. `options`
+        are the arguments of `collect` other than the store and the runs, as JSON values.
+        """
+        curves = curves or {}
         return cls(
             figure=figure,
             run_ids=tuple(run.id for run in runs),
@@ -66,8 +78,9 @@ class Provenance:
             dataset_hashes=_distinct(run.dataset_hash for run in runs if run.dataset_hash),
             code=_distinct(run.code for run in runs),
             drawn_with=__version__,
-            runs=tuple(_source(run) for run in runs),
+            runs=tuple(_source(run, curves.get(run.id, run.method)) for run in runs),
             differs=spec_differences(runs),
+            options=dict(options or {}),
         )
 
     @classmethod
@@ -122,10 +135,10 @@ def _distinct(values: Any) -> tuple[str, ...]:
     return tuple(sorted(set(values)))
 
 
-def _source(run: RunRow) -> RunSource:
+def _source(run: RunRow, curve: str) -> RunSource:
     return RunSource(
         id=run.id,
-        curve=run.method,
+        curve=curve,
         method=run.method,
         environment=run.environment,
         profile=run.profile,

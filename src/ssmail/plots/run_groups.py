@@ -38,6 +38,11 @@ class Selection:
         """Every run, group after group."""
         return tuple(run for group in self.groups for run in group.runs)
 
+    @property
+    def curves(self) -> dict[str, str]:
+        """By run id, the label of the group that the run is drawn in."""
+        return {run.id: group.label for group in self.groups for run in group.runs}
+
 
 def check_settled(runs: Iterable[RunRow], lacking: str) -> None:
     """Raise InputError for a run that neither finished nor diverged; `lacking` is what it therefore does not have."""

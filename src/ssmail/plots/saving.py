@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -45,26 +44,5 @@ def digest(csv: str) -> str:
 
 
 def embedded(record: FigureRecord, csv: str) -> Provenance:
-    """What is written into the files: the record's provenance, with the curve of each run, the options and the CSV.
-
-    The options are those that `collect` takes beside the store and the runs: the record's `options` where it has them,
-    else its `statistic` where it has one.
-    """
-    curves = _curves(record.table())
-    source = record.provenance
-    options: dict[str, Any] = dict(getattr(record, "options", {}))
-    if not options and hasattr(record, "statistic"):
-        options = {"statistic": str(record.statistic)}
-    runs = tuple(replace(run, curve=curves.get(run.id, run.curve)) for run in source.runs)
-    return replace(source, runs=runs, options=options, csv_sha256=digest(csv))
-
-
-def _curves(table: pd.DataFrame) -> dict[str, str]:
-    """By run id, the curve it is drawn in: the column before `run_id` tells it, such as `label` or `beta`."""
-    columns = list(table.columns)
-    if "run_id" not in columns or columns.index("run_id") == 0:
-        return {}
-    name = columns[columns.index("run_id") - 1]
-    pairs = table[[name, "run_id"]].dropna().drop_duplicates()
-    prefix = "" if name == "label" else f"{name} "
-    return {run_id: f"{prefix}{value}" for value, run_id in pairs.itertuples(index=False) if run_id}
+    """Return the provenance that is written into the files: the record's, with the hash of its CSV."""
+    return replace(record.provenance, csv_sha256=digest(csv))

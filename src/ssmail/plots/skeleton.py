@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,7 +20,7 @@ from matplotlib.ticker import MultipleLocator
 from PIL import Image
 
 from ssmail.data import expert_sets
-from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
+from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError, unknown_name
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
@@ -43,9 +42,6 @@ MARGIN = 1.2  # around the skeleton, in file units, of which a person has about 
 TICK = 10.0
 HIGHEST = 5.0  # inches of a film
 STILL = 1e-6  # a root that moves less, in file units, does not say where it walks
-
-Floats = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

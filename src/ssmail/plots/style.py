@@ -17,6 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from ssmail.data.trajectories import Floats
+
 COLUMN_WIDTH = 3.4  # inches: one column of a two-column page
 RESOLUTION = 300  # dots per inch of a PNG
 
@@ -51,9 +53,6 @@ SHEET: dict[Any, Any] = {
     "xtick.labelsize": 7,
     "ytick.labelsize": 7,
 }
-
-
-Floats = npt.NDArray[np.float64]
 
 
 class Stroke(NamedTuple):

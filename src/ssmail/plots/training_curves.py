@@ -23,6 +23,7 @@ from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, silent
+from ssmail.plots.formatting import counted
 from ssmail.plots.metric_units import label, last_part
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, by_spec, check_one_data_set, newest_of_each_seed
@@ -54,16 +55,9 @@ class TrainingRecord:
     """Everything that the figure shows, in the metrics' own units."""
 
     panels: tuple[Panel, ...]
-    group_by: str
     statistic: Statistic
     provenance: Provenance
     notes: tuple[str, ...]
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """With which it was collected."""
-        metrics = [panel.metric for panel in self.panels]
-        return {"metrics": metrics, "group_by": self.group_by, "statistic": str(self.statistic)}
 
     @property
     def stem(self) -> str:
@@ -94,6 +88,7 @@ def collect(
     runs = sorted(runs, key=lambda run: run.started)
     panels: list[Panel] = []
     drawn: dict[str, RunRow] = {}
+    curve_of: dict[str, str] = {}
     notes: list[str] = []
     reached = _reached(store, runs)
     for metric in dict.fromkeys(metrics):
@@ -105,14 +100,15 @@ def collect(
             check_one_data_set(NAME, group.runs)
         panels.append(Panel(metric, tuple(band(group, metric, values, statistic, reached) for group in groups)))
         drawn |= {run.id: run for group in groups for run in group.runs}
+        curve_of |= {run.id: group.label for group in groups for run in group.runs}
         notes += left_out
         if panels[-1].logarithmic:
             notes += curve_notes.cut(panels[-1].bands)
+    options = {"metrics": [panel.metric for panel in panels], "group_by": group_by, "statistic": statistic}
     return TrainingRecord(
         panels=tuple(panels),
-        group_by=group_by,
         statistic=statistic,
-        provenance=Provenance.of(NAME, list(drawn.values())),
+        provenance=Provenance.of(NAME, list(drawn.values()), curves=curve_of, options=options),
         notes=tuple(notes),
     )
 
@@ -152,7 +148,7 @@ def _groups(runs: Sequence[RunRow], values: pd.DataFrame, group_by: str) -> tupl
     kept = {run.id for group in groups for run in group.runs}
     older = sum(run.id not in kept for run in there)
     notes = [f"{values['name'].iloc[0]}: {len(without)} of the chosen runs have none."] if without else []
-    notes += [f"{older} older run{'s' * (older > 1)} of the same spec and seed left out."] if older else []
+    notes += [f"{counted(older, 'older run')} of the same spec and seed left out."] if older else []
     return groups, notes
 
 
