@@ -28,6 +28,8 @@ autodoc_default_options = {
 }
 python_maximum_signature_line_length = 100
 
+smartquotes = False  # it would turn --env into a dash
+
 html_theme = "furo"
 html_title = "ssmail"
 html_copy_source = False
