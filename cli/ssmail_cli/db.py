@@ -12,7 +12,7 @@ from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, write_json
 
 if TYPE_CHECKING:
-    from ssmail.paper.needs import Needs
+    from ssmail.paper.reads import Contents
     from ssmail.store.maintenance.compact import Compact
     from ssmail.store.maintenance.merge import Merge
     from ssmail.store.maintenance.run_rows import Difference
@@ -146,10 +146,7 @@ def export(
     Keeps the newest finished or diverged run of each spec and seed, with the last value of every metric and the curves
     and arrays that figures and claims read, but no checkpoints. Reports what is left out.
     """
-    from functools import partial
-
-    from ssmail.paper.judgement import judge
-    from ssmail.paper.needs import needs
+    from ssmail.paper.reads import contents
     from ssmail.store import Store
     from ssmail.store.maintenance.compact import export_compact, settled_cells
     from ssmail.store.maintenance.sqlite_file import existing, require_current
@@ -164,8 +161,7 @@ def export(
     runs = settled_cells(matching)
     if not runs:
         raise InputError(f"no finished or diverged run in {db} meets these conditions; `ssmail runs list` shows all.")
-    claims = [partial(judge, profile=name) for name in (None, *{run.profile: None for run in runs})]
-    needed = needs(store, runs, claims)
+    needed = contents(store, runs)
     done = export_compact(db, file, runs, needed.wanted)
     others = len(store.runs()) - len(runs)
     if as_json:
@@ -219,7 +215,7 @@ def _merge_json(done: "Merge") -> dict[str, Any]:
     return {**names, "runs": runs, "differences": differences, "without_checkpoints": done.without_checkpoints}
 
 
-def _print_export(done: "Compact", needed: "Needs", others: int) -> None:
+def _print_export(done: "Compact", needed: "Contents", others: int) -> None:
     """Print the file on stdout, and what is not in it on stderr."""
     print(f"wrote {done.path}, {_size(done.size_bytes)}: {counted(done.runs, 'run')}")
     note(

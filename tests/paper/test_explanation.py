@@ -12,7 +12,7 @@ import pytest
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.explanation import compare, explain
-from ssmail.paper.needs import needs
+from ssmail.paper.reads import contents
 from ssmail.paper.results import FIGURES, save
 from ssmail.plots import NoRuns, provenance, training_curves
 from ssmail.plots.saving import digest, save_figure
@@ -131,7 +131,7 @@ def test_training_curves_too(filled: Store, tmp_path: Path) -> None:
 def test_a_compact_export_agrees(filled: Store, tmp_path: Path) -> None:
     image, _ = saved(filled, "fig5", tmp_path)
     runs = filled.runs()
-    export_compact(filled.where, tmp_path / "small.db", runs, needs(filled, runs).wanted)
+    export_compact(filled.where, tmp_path / "small.db", runs, contents(filled, runs).wanted)
     small = Store.open(tmp_path / "small.db")
     assert compare(explain(image), small).agrees is True
     small.close()

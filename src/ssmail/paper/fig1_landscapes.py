@@ -35,6 +35,7 @@ from ssmail.errors import InputError
 from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
@@ -45,6 +46,7 @@ from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig1"
 SHARE, COSINE = "landscape/slope_share", "landscape/cosine"
+READS = Reads(curves=(SHARE, COSINE), landscapes=True)
 CLAIM = Claim(
     name="C7",
     alias="landscapes",

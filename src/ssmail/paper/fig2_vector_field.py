@@ -28,9 +28,10 @@ from matplotlib.lines import Line2D
 from ssmail.config.experiments import display_value
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
-from ssmail.evaluation.landscape import cosines
+from ssmail.evaluation.landscape import Plane, cosines
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.formatting import setting
@@ -42,6 +43,9 @@ from ssmail.store.comparison import latest_values
 
 NAME = "fig2"
 BEHIND, AHEAD = "landscape/behind_cosine", "landscape/ahead_cosine"
+FIELD = ("alpha", "current", "expert", "gradient")  # the arrays of a vector field
+AXES = ("landscape/x", "landscape/y")
+READS = Reads(arrays=dict.fromkeys([*(f"vector_field/{kind}" for kind in FIELD), *AXES]))
 CLAIM = Claim(
     name="C8",
     alias="vector-field",
@@ -154,7 +158,7 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
     return VectorFieldRecord(
         fields=fields,
         measured=measured,
-        spacing=landscape_grids.read(store, first, landscape_grids.stored_epochs(store, first)[0]).plane.spacing,
+        spacing=Plane(*(store.array(first.id, name).astype(np.float64) for name in AXES)).spacing,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=(*selection.notes, *_notes(measured, fields)),
     )
@@ -198,8 +202,7 @@ def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
 def _field(store: Store, measured: Measured) -> Field:
     run = measured.run
     metrics = store.latest_metrics([run.id], names=[BEHIND])
-    kinds = ("alpha", "current", "expert", "gradient")
-    arrays = (store.array(run.id, f"vector_field/{kind}").astype(np.float64) for kind in kinds)
+    arrays = (store.array(run.id, f"vector_field/{kind}").astype(np.float64) for kind in FIELD)
     return Field(measured.label, run, int(metrics["step"].iloc[0]), *arrays)
 
 

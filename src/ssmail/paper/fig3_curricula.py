@@ -25,6 +25,7 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band, check_recorded
@@ -36,6 +37,7 @@ from ssmail.store import Store
 NAME = "fig3"
 DASHES = (0, (4, 2))
 MEASURED, EXPECTED = "curriculum/segment_length", "curriculum/expected_segment_length"
+READS = Reads(curves=(MEASURED, EXPECTED))
 CLAIM = Claim(
     name="C6",
     alias="curricula",

@@ -27,6 +27,7 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
@@ -36,6 +37,8 @@ from ssmail.store import Store
 
 NAME = "fig4"
 METRIC = "train/mode_mse"
+VALIDATION = "validation/mode_mse"
+READS = Reads(curves=(METRIC, VALIDATION, f"{REFERENCE}/mode_mse"))
 CLAIM = Claim(
     name="C1",
     alias="stability",
@@ -114,7 +117,7 @@ def fluctuation(errors: Floats) -> float:
 
 def samples(runs: Runs) -> tuple[tuple[Sample, ...], tuple[Sample, ...]]:
     """Remaining errors and fluctuations, each in the order of METHODS."""
-    errors = (METRIC, "validation/mode_mse", f"{REFERENCE}/mode_mse")
+    errors = READS.curves
     return (
         tuple(runs.computed(method, runs.curve, errors, remaining_error, diverged=WORST) for method in METHODS),
         tuple(runs.computed(method, runs.curve, [METRIC], fluctuation, diverged=WORST) for method in METHODS),

@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
@@ -139,7 +140,7 @@ def shown_rollouts(samples: Floats) -> Floats:
     return samples[np.arange(len(starts)) % len(samples), starts][None]
 
 
-THINNINGS = {LANES: shown_lanes, ROLLOUTS: shown_rollouts}
+READS = Reads(arrays={LANES: shown_lanes, ROLLOUTS: shown_rollouts})
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:

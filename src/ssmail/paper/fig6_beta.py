@@ -28,6 +28,7 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
 from ssmail.plots.curves import constant_velocity
@@ -38,6 +39,7 @@ from ssmail.store import Store
 
 NAME = "fig6"
 ERROR, BALANCE = "test/mode_mse", "test/lane_balance"
+READS = Reads()  # last values alone
 CLAIM = Claim(
     name="C3",
     alias="beta",

@@ -40,6 +40,7 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, Curve, band
@@ -60,6 +61,9 @@ CLAIM = Claim(
     figure=NAME,
 )
 NOISY, SPREAD = "test_noisy/mse", "test_noisy/mse_spread"
+READS = Reads(
+    arrays=dict.fromkeys([*(f"{what}{end}/mse" for what in ("test", REFERENCE) for end in CONDITIONS.values()), SPREAD])
+)
 GROWTH = f"slope of the least-squares line through {NOISY} over all predicted steps, squared scaled units per step"
 SPREADING = f"likewise of {SPREAD}, the standard deviation over test windows"
 LATE = f"slope of {NOISY} over the last half of the predicted steps, squared scaled units per step"

@@ -33,6 +33,7 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
+from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, check_recorded, constant_velocity
@@ -46,6 +47,7 @@ from ssmail.store import Store
 NAME = "fig8"
 ERRORS = {"mocap": "mse", "letters": "mse", "yjunction": "mode_mse"}  # of the upper panel, by environment
 TERMS = ("discriminator/generated", "discriminator/expert")
+READS = Reads(curves=(*TERMS, *(f"train/{error}" for error in sorted(set(ERRORS.values())))))
 LOSS = " + ".join(TERMS)
 UNDECIDED = 0.5  # the loss of a D that outputs 1/2 everywhere
 CLAIM = Claim(

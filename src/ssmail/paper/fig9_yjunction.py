@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from ssmail.config.experiments import figure_requirements
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.errors import InputError
+from ssmail.paper.reads import Reads
 from ssmail.plots import NoRuns, style
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.series import train_command
@@ -24,6 +25,7 @@ from ssmail.store import RunRow, Store
 
 NAME = "fig9"
 ARRAYS = ("train/expert", "train/lane", "lane_centres")
+READS = Reads(arrays=dict.fromkeys(ARRAYS))
 SNAPSHOTS = 4  # time steps at which the agents are shown, including the first and the last
 MARKERS = ("o", "s", "^", "D", "v", "P")
 

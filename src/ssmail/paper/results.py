@@ -7,7 +7,7 @@ figure's module is imported when it is used.
 """
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from ssmail.evaluation.statistics import Statistic
     from ssmail.paper.claims import Claim, Part
+    from ssmail.paper.reads import Reads
     from ssmail.paper.samples import Runs
     from ssmail.store import Store
-    from ssmail.store.maintenance.compact import Thinning
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,10 @@ class FigureModule:
         module = self._module()
         return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
 
-    def thinnings(self) -> "Mapping[str, Thinning]":
-        """By the names of stored arrays, what makes of each the part that the figure shows, where it does not show all.
-
-        The figure shows the same of the part as of the whole.
-        """
-        return cast("Mapping[str, Thinning]", getattr(self._module(), "THINNINGS", {}))
+    @property
+    def reads(self) -> "Reads":
+        """What the figure and its claim read from the runs that it draws."""
+        return cast("Reads", self._module().READS)
 
     def _module(self) -> Any:
         return importlib.import_module(f"ssmail.paper.{self.stem}")

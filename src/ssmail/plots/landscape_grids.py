@@ -61,11 +61,25 @@ class Landscape:
 
 def stored_epochs(store: Store, run: RunRow) -> list[int]:
     """The epochs whose landscapes the run stored, rising. Raises InputError, with the remedy, when there is none."""
-    names = [re.fullmatch(r"landscape/(\d+)/reward", name) for name in store.array_names(run.id)]
-    epochs = sorted(int(found[1]) for found in names if found)
+    epochs = _epochs(store.array_names(run.id))
     if not epochs:
         raise InputError(f"run {run.name} {_lack(run)}")
     return epochs
+
+
+def first_and_last(names: Sequence[str]) -> list[str]:
+    """Return those of a run's arrays that hold the first and the last of its landscapes (`read`)."""
+    epochs = _epochs(names)
+    each = [
+        f"{epoch:04d}/{part}" for epoch in {*epochs[:1], *epochs[-1:]} for part in ("reward", "gradient", "rollouts")
+    ]
+    return [f"landscape/{part}" for part in ("x", "y", "unit", "expert", *each)] if epochs else []
+
+
+def _epochs(names: Sequence[str]) -> list[int]:
+    """The epochs of the landscapes among these arrays, rising."""
+    found = (re.fullmatch(r"landscape/(\d+)/reward", name) for name in names)
+    return sorted(int(match[1]) for match in found if match)
 
 
 def _lack(run: RunRow) -> str:

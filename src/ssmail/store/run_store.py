@@ -2,7 +2,8 @@
 
 import shutil
 import uuid
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from copy import copy
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -39,6 +40,7 @@ class Store:
         on_sqlite = engine.dialect.name == "sqlite"
         file = Path(str(engine.url.database)) if on_sqlite else Path("results/ssmail.db").absolute()
         self.checkpoint_root = checkpoint_root_of(file)
+        self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
     def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS) -> Self:
@@ -73,7 +75,14 @@ class Store:
         with reading(self._engine) as connection:
             if ids is not None:
                 conditions.append(run.c.id.in_(queries.resolve(connection, ids)))
-            return queries.runs(connection, *conditions)
+            found = queries.runs(connection, *conditions)
+        return found if self._only is None else [row for row in found if row.id in self._only]
+
+    def only(self, run_ids: Iterable[str]) -> Self:
+        """Return the same store, except that its `runs` are among these (full ids); both use the same connections."""
+        other = copy(self)
+        other._only = frozenset(run_ids)
+        return other
 
     def find_cell(self, spec_hash: str, seed: int) -> RunRow | None:
         """Return the newest run of the cell, or None."""

@@ -1,13 +1,12 @@
 """A compact export judges every claim exactly as the whole database does."""
 
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from ssmail.paper.judgement import Judgement, judge
-from ssmail.paper.needs import needs
+from ssmail.paper.reads import contents
 from ssmail.store import Store
 from ssmail.store.maintenance.compact import Wanted, export_compact, settled_cells
 
@@ -28,8 +27,7 @@ def test_claims_are_judged_alike_from_an_export(store: Store, store_claim: Calla
         store_claim(claim, scenario("true"))
     whole, runs = judgements(store), settled_cells(store.runs())
     assert all("inconclusive" not in text or text.count("Sample(") for text in whole.values())
-    for name, readers in (("with", [judge, partial(judge, profile="smoke")]), ("without", [])):
-        wanted = needs(store, runs, readers).wanted if readers else Wanted((), {})
+    for name, wanted in (("with", contents(store, runs).wanted), ("without", Wanted((), {}))):
         export_compact(store.where, tmp_path / f"{name}.db", runs, wanted)
     small, bare = Store.open(tmp_path / "with.db"), Store.open(tmp_path / "without.db")
     assert judgements(small) == whole
@@ -50,7 +48,7 @@ def test_no_more_rollouts_are_kept_than_figure_5_shows(
     runs["dnri"] = [{"arrays": {"test/rollouts": rollouts, "test/lanes": lanes}}] * 5
     store_claim("C2", runs)
     stored = store.runs()
-    export_compact(store.where, tmp_path / "small.db", stored, needs(store, stored, [judge]).wanted)
+    export_compact(store.where, tmp_path / "small.db", stored, contents(store, stored).wanted)
     small = Store.open(tmp_path / "small.db")
     run = small.runs(method="dnri")[0]
     assert small.array(run.id, "test/rollouts").shape == (1, 16, 3, 2, 2)

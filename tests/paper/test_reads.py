@@ -1,5 +1,6 @@
 """A compact export draws every figure exactly as the whole database does."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -7,8 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ssmail.paper.needs import USUAL_CURVES, RecordingStore, needs
-from ssmail.paper.results import FIGURES
+from ssmail.paper import fig5_modes
+from ssmail.paper.reads import USUAL_CURVES, Reads, contents
+from ssmail.paper.results import CLAIMS, FIGURES
+from ssmail.paper.samples import Runs
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 from ssmail.store.maintenance.compact import Wanted, export_compact, settled_cells
@@ -50,7 +53,7 @@ def tables(store: Store) -> dict[str, pd.DataFrame | str]:
 
 def exported(store: Store, target: Path, wanted: Wanted | None = None) -> Store:
     runs = settled_cells(store.runs())
-    export_compact(store.where, target, runs, wanted or needs(store, runs).wanted)
+    export_compact(store.where, target, runs, wanted or contents(store, runs).wanted)
     return Store.open(target)
 
 
@@ -78,7 +81,7 @@ def test_without_what_they_need_the_figures_fail_or_differ(filled: Store, tmp_pa
 
 def test_only_what_is_read_is_wanted_and_of_rollouts_the_part_that_is_shown(filled: Store, tmp_path: Path) -> None:
     runs = settled_cells(filled.runs())
-    wanted = needs(filled, runs).wanted
+    wanted = contents(filled, runs).wanted
     assert set(USUAL_CURVES) <= set(wanted.curves)
     assert "actor/loss" not in wanted.curves
     shown = FIGURES["fig5"].collect(filled).provenance.run_ids
@@ -89,37 +92,59 @@ def test_only_what_is_read_is_wanted_and_of_rollouts_the_part_that_is_shown(fill
     small.close()
 
 
-def test_an_array_that_one_figure_needs_whole_is_kept_whole(filled: Store) -> None:
-    recorder = RecordingStore.open(filled.url)
-    run = next(run.id for run in filled.runs() if "test/lanes" in filled.array_names(run.id))
-    recorder.show([run])
-    recorder.thinnings = {"test/lanes": np.asarray}
-    recorder.array(run, "test/lanes")
-    assert recorder.arrays[run]["test/lanes"] is not None
-    recorder.thinnings = {}
-    recorder.array(run, "test/lanes")
-    assert recorder.arrays[run]["test/lanes"] is None
-    recorder.close()
-
-
 def test_figures_that_cannot_be_drawn_are_told(store: Store, add_run: Any) -> None:
     add_run(0)
-    undrawable = needs(store, store.runs()).undrawable
+    undrawable = contents(store, store.runs()).undrawable
     assert {"fig3", "fig7", "fig8"} <= set(undrawable)
     assert not {"fig4", "fig5", "fig9"} & set(undrawable)
     assert undrawable["fig7"].startswith("fig7 has nothing to draw")
 
 
-def test_what_other_readers_need_is_kept_too_as_thin_as_figures_want_it(filled: Store) -> None:
+class RecordingStore(Store):
+    """A store that remembers which curves and arrays are read."""
+
+    curves: set[str]
+    read: set[tuple[str, str]]
+
+    def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> pd.DataFrame:
+        frame = super().metrics(run_ids, names)
+        self.curves |= set(names if names is not None else frame["name"])
+        return frame
+
+    def array(self, run_id: str, name: str) -> np.ndarray:
+        self.read.add((run_id, name))
+        return super().array(run_id, name)
+
+
+@pytest.mark.parametrize("name", sorted({module.name for module in FIGURES.values()}))
+def test_a_figure_and_its_claim_read_no_more_than_the_figure_declares(
+    name: str, filled: Store, add_landscapes: Any
+) -> None:
+    for method in ("gail", "ssail"):
+        add_landscapes(0, method)
+    figure, recorder = FIGURES[name], RecordingStore.open(filled.url)
+    recorder.curves, recorder.read = set(), set()
+    figure.collect(recorder)
+    if name in CLAIMS:
+        figure.decide(Runs.of_figure(recorder, name, None))
+    assert recorder.curves <= {*figure.reads.curves, *USUAL_CURVES}
+    for run, array in recorder.read:
+        assert array in figure.reads.stored(recorder.array_names(run)), array
+    assert recorder.curves or recorder.read or name == "fig6"
+    recorder.close()
+
+
+def test_the_declarations_are_needed(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: without its declaration the test above finds what figure 5 reads."""
+    assert "test/rollouts" in FIGURES["fig5"].reads.stored(["test/rollouts"])
+    monkeypatch.setattr(fig5_modes, "READS", Reads())
+    assert FIGURES["fig5"].reads.stored(["test/rollouts"]) == {}
     runs = settled_cells(filled.runs())
-    shown = next(run for run, names in needs(filled, runs).wanted.arrays.items() if "test/rollouts" in names)
+    assert not any("test/rollouts" in names for names in contents(filled, runs).wanted.arrays.values())
 
-    def read(store: Store) -> None:
-        store.metrics([shown], ["actor/loss"])
-        store.array(shown, "test/rollouts")
-        store.array(shown, "lane_centres")
 
-    wanted = needs(filled, runs, [read]).wanted
-    assert "actor/loss" in wanted.curves
-    assert wanted.arrays[shown]["test/rollouts"] is not None
-    assert wanted.arrays[shown]["lane_centres"] is None
+def test_only_some_runs_are_chosen_from(filled: Store) -> None:
+    some = [run.id for run in filled.runs(method="dnri")]
+    assert [run.id for run in filled.only(some).runs()] == some
+    assert len(filled.runs()) > len(some)
+    assert filled.only(some).runs(method="ssail") == []

@@ -1,0 +1,82 @@
+"""What figures and claims read from runs, and so what a compact export keeps."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from ssmail.errors import InputError
+from ssmail.store import RunRow, Store
+from ssmail.store.maintenance.compact import Thinning, Wanted
+
+if TYPE_CHECKING:
+    from ssmail.paper.results import FigureModule
+
+USUAL_CURVES = tuple(
+    f"{split}/{error}" for split in ("train", "validation") for error in ("mode_mse", "mse", "stroke_distance")
+)
+"""The errors of every epoch: kept for all runs, whether or not a figure reads them."""
+
+
+@dataclass(frozen=True)
+class Reads:
+    """What a figure and its claim read from a run, besides the last values of metrics.
+
+    curves: metrics that are read over the epochs. arrays: names of arrays, each with the Thinning that reduces it to
+    what the figure shows, or None when all of it is read; the figure shows the same from the thinned array. landscapes:
+    whether the first and the last stored landscape are read.
+    """
+
+    curves: tuple[str, ...] = ()
+    arrays: Mapping[str, Thinning | None] = field(default_factory=dict)
+    landscapes: bool = False
+
+    def stored(self, names: Sequence[str]) -> dict[str, Thinning | None]:
+        """Return those of a run's arrays (`names`, sorted) that are read."""
+        from ssmail.plots.landscape_grids import first_and_last  # imported here because it needs matplotlib
+
+        read = {name: thin for name, thin in self.arrays.items() if name in names}
+        return read | dict.fromkeys(first_and_last(names)) if self.landscapes else read
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What to keep of some runs, and which figures cannot be drawn from them, each with the reason."""
+
+    wanted: Wanted
+    undrawable: Mapping[str, str]
+
+
+def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
+    """Return what all figures and claims read if these runs are the only ones.
+
+    Figures are drawn, and claims judged, from any profile and from each, and where possible on each environment.
+    """
+    from ssmail.paper.results import FIGURES
+
+    only = store.only(run.id for run in runs)
+    curves = set(USUAL_CURVES)
+    arrays: dict[str, dict[str, Thinning | None]] = {}
+    undrawable: dict[str, str] = {}
+    for figure in dict.fromkeys(FIGURES.values()):
+        curves |= set(figure.reads.curves)
+        for run_id in _drawn(only, figure, runs, undrawable):
+            arrays.setdefault(run_id, {}).update(figure.reads.stored(store.array_names(run_id)))
+    return Contents(Wanted(frozenset(curves), arrays), undrawable)
+
+
+def _drawn(store: Store, figure: "FigureModule", runs: Sequence[RunRow], undrawable: dict[str, str]) -> Iterator[str]:
+    """Yield the runs that the figure or its claim chooses; record in `undrawable` why it cannot be drawn by default."""
+    from ssmail.plots.series import select
+
+    environments = [None, *sorted({run.environment for run in runs})] if figure.has_environment else [None]
+    for profile in (None, *sorted({run.profile for run in runs})):
+        for environment in environments:
+            try:
+                yield from figure.collect(store, profile=profile, environment=environment).provenance.run_ids
+            except InputError as error:
+                if profile is None and environment is None:
+                    undrawable[figure.name] = str(error)
+        try:
+            yield from (run.id for run in select(store, figure.name, profile=profile).runs)
+        except InputError:
+            continue
