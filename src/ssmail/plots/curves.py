@@ -186,7 +186,7 @@ def draw_centre(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> L
 
 
 def _draw_end(axes: Axes, curve: Curve, stroke: style.Stroke, upwards: bool) -> None:
-    """Draw a cross at the epoch that diverged: at the top edge, joined to the last finite value, or beside that value."""
+    """Draw a cross at the epoch that diverged: at the top edge, joined to the last finite value, or beside it."""
     if curve.diverged_at is None:
         return
     before = np.flatnonzero(np.isfinite(curve.values) & (curve.epochs < curve.diverged_at))
