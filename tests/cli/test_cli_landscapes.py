@@ -44,7 +44,7 @@ def test_the_landscape_of_a_run(cli: CommandLine, run: str, where: tuple[object,
     assert outcome.err == f"landscape: run {run}: ssail on yjunction, seed 0, finished; landscapes of epochs 0, 1, 3.\n"
     untrained = cli("plot", "landscape", "--run", run, "--epoch", 0, *where)
     assert names(untrained.out)[0] == f"landscape_{run}_0.png"
-    assert "those it has: 0, 1, 3" in cli("plot", "landscape", "--run", run, "--epoch", 2, *where).sentence
+    assert "choose one of 0, 1, 3" in cli("plot", "landscape", "--run", run, "--epoch", 2, *where).sentence
 
 
 def test_the_film_of_a_run(cli: CommandLine, run: str, where: tuple[object, ...], tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ def test_the_last_epoch_is_shown_unless_another_is_asked_for(store: Store, add_l
     assert [landscape.epoch for landscape in record.landscapes] == [3]
     assert record.stem == f"landscape_{run[:8]}_3"
     assert [landscape.epoch for landscape in collect(store, run, LANDSCAPE, 0).landscapes] == [0]
-    with pytest.raises(InputError, match="no landscape of epoch 2; those it has: 0, 1, 3"):
+    with pytest.raises(InputError, match="no landscape of epoch 2; choose one of 0, 1, 3"):
         collect(store, run, LANDSCAPE, 2)
 
 
@@ -56,9 +56,9 @@ def test_a_film_has_a_picture_of_each_epoch_and_names_its_run(
 
 def test_runs_that_have_none_say_why(store: Store, add_run: AddRun, add_forecast: AddRun) -> None:
     for run, reason in (
-        (add_run(), "is older than they are"),
+        (add_run(), "an older ssmail trained it"),
         (add_run(method="bc"), r"\(bc\) learns no reward"),
-        (add_forecast(), "is on mocap, which is no plane"),
+        (add_forecast(), "is on mocap, which is not planar"),
     ):
         with pytest.raises(InputError, match=reason):
             collect(store, run, LANDSCAPE)

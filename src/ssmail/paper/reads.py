@@ -1,6 +1,7 @@
 """What figures and claims read from runs, and so what a compact export keeps."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -66,8 +67,6 @@ def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
 
 def _drawn(store: Store, figure: "FigureModule", runs: Sequence[RunRow], undrawable: dict[str, str]) -> Iterator[str]:
     """Yield the runs that the figure or its claim chooses; record in `undrawable` why it cannot be drawn by default."""
-    from ssmail.plots.series import select
-
     environments = [None, *sorted({run.environment for run in runs})] if figure.has_environment else [None]
     for profile in (None, *sorted({run.profile for run in runs})):
         for environment in environments:
@@ -76,7 +75,15 @@ def _drawn(store: Store, figure: "FigureModule", runs: Sequence[RunRow], undrawa
             except InputError as error:
                 if profile is None and environment is None:
                     undrawable[figure.name] = str(error)
-        try:
-            yield from (run.id for run in select(store, figure.name, profile=profile).runs)
-        except InputError:
-            continue
+                yield from _judged(store, figure, profile, environment)
+
+
+def _judged(store: Store, figure: "FigureModule", profile: str | None, environment: str | None) -> Iterator[str]:
+    """Yield the runs that the claim can be judged from although the figure cannot be drawn."""
+    from ssmail.plots.series import select
+
+    together = {name for name, thin in figure.reads.arrays.items() if thin is not None}
+    with suppress(InputError):
+        for run in select(store, figure.name, profile=profile, environment=environment).runs:
+            if together <= {*store.array_names(run.id)}:
+                yield run.id

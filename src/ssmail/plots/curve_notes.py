@@ -1,4 +1,4 @@
-"""What the reader of curves and bands has to be told beside them: what a scale cuts off, and how groups compare."""
+"""Notes on curves and bands: what the scale cuts off, and how the groups compare."""
 
 import math
 from collections.abc import Sequence
@@ -11,12 +11,12 @@ from ssmail.plots.curves import CEILING, Band, Curve
 
 
 def of_errors(bands: Sequence[Band]) -> tuple[str, ...]:
-    """All notes on errors over epochs."""
+    """Return all notes on errors over epochs."""
     return (*high(bands), *cut(bands), *comparisons(bands))
 
 
 def cut(bands: Sequence[Band]) -> tuple[str, ...]:
-    """Whose band a logarithmic scale does not show whole."""
+    """Name the groups whose band a logarithmic scale cuts off."""
     labels = [shown.label for shown in bands if shown.is_cut]
     if not labels:
         return ()
@@ -25,7 +25,7 @@ def cut(bands: Sequence[Band]) -> tuple[str, ...]:
 
 
 def high(bands: Sequence[Band], end: float = CEILING) -> tuple[str, ...]:
-    """How many runs rise above the end of a scale."""
+    """Count the runs of each group that rise above the end of the scale."""
     counts = {shown.label: sum(_rises(curve, end) for curve in shown.curves) for shown in bands}
     return tuple(
         f"{label}: {n} of the runs rise above {end:.3g}, where the scale ends." for label, n in counts.items() if n
@@ -37,13 +37,13 @@ def _rises(curve: Curve, end: float) -> bool:
 
 
 def comparisons(bands: Sequence[Band]) -> tuple[str, ...]:
-    """The first group against each other one at the end of training, a diverged run being the worst."""
+    """Compare the first group with each other group at the last epoch. A diverged run ranks worst."""
     notes = []
     for other in bands[1:]:
         a, b = (shown.last for shown in (bands[0], other))
         unfinished, many = np.isnan([*a, *b]).any(), math.comb(len(a) + len(b), len(a)) > MAX_SPLITS
         if unfinished or many:
-            continue  # there is no last epoch, or no enumerating all splits
+            continue  # some run has no value at the last epoch, or there are too many splits to enumerate
         found = permutation_test(a, b, on="ranks")
         notes.append(
             f"{bands[0].label} against {other.label} at the last epoch: medians {np.median(a):.3g} and "

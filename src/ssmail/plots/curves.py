@@ -55,7 +55,7 @@ class Band:
 
     @property
     def diverged(self) -> int:
-        """How many runs diverged."""
+        """Number of runs that diverged."""
         return sum(curve.diverged_at is not None for curve in self.curves)
 
     @property
@@ -71,7 +71,7 @@ class Band:
         return np.array([_over(final, curve, self.upwards)[0] for curve in self.curves])
 
     def edges(self, logarithmic: bool, top: float) -> tuple[Floats, Floats]:
-        """(E,) twice, the band as it is drawn: nowhere unless it has a lower end, and no higher than `top` if infinite.
+        """Return the band as drawn, twice (E,): nowhere without a lower end, and up to `top` where it is infinite.
 
         On a logarithmic scale style.cut_low applies.
         """
@@ -81,7 +81,7 @@ class Band:
 
     @property
     def is_cut(self) -> bool:
-        """Whether a logarithmic scale does not show the whole band."""
+        """Whether a logarithmic scale cuts the band off."""
         return bool((self.summary.low < self.edges(True, np.inf)[0]).any())
 
     @property
@@ -91,7 +91,7 @@ class Band:
         return lowest
 
     def rows(self, statistic: Statistic) -> Iterator[tuple[object, ...]]:
-        """Rows of COLUMNS, for a table of what is shown; kind: run, mean or median, diverged."""
+        """Yield rows of COLUMNS for the CSV; kind: run, mean or median, diverged."""
         for curve in self.curves:
             points = zip(curve.epochs, curve.values, strict=True)
             yield from (("run", self.label, curve.run_id, curve.seed, *point, np.nan, np.nan) for point in points)
@@ -110,7 +110,7 @@ def band(
     statistic: Statistic,
     reached: Mapping[str, int] | None = None,
 ) -> Band:
-    """The metric of the group's runs; `values` is Store.metrics of it, of these runs at least.
+    """Make the band of a metric from `values`: Store.metrics of it, for at least the runs of the group.
 
     `reached` tells the last epoch that a run (by id) completed, where that need not be the last one with this metric.
     """
@@ -125,7 +125,7 @@ def band(
 
 
 def silent(group: Group, values: pd.DataFrame) -> list[RunRow]:
-    """The runs of the group that have no value, other than diverged ones: there is nothing to draw of them."""
+    """Return the runs without a value that have not diverged; nothing can be drawn of them."""
     there = set(values["run_id"])
     return [run for run in group.runs if run.id not in there and run.state is not RunState.DIVERGED]
 
@@ -150,7 +150,7 @@ def _curve(run: RunRow, values: pd.DataFrame, reached: int, error: bool) -> Curv
 
 
 def _over(epochs: Integers, curve: Curve, error: bool) -> Floats:
-    """(E,) the curve at these epochs, for the statistics."""
+    """Return the curve at these epochs (E,), for the statistics."""
     known = {epoch: value for epoch, value in zip(curve.epochs, curve.values, strict=True) if np.isfinite(value)}
     row = np.array([known.get(epoch, np.nan) for epoch in epochs], dtype=np.float64)
     if error and curve.diverged_at is not None:
@@ -186,7 +186,7 @@ def draw_centre(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> L
 
 
 def _draw_end(axes: Axes, curve: Curve, stroke: style.Stroke, upwards: bool) -> None:
-    """A cross at the epoch that diverged: at the top edge and joined to the last finite value, or beside that value."""
+    """Draw a cross at the epoch that diverged: at the top edge, joined to the last finite value, or beside it."""
     if curve.diverged_at is None:
         return
     before = np.flatnonzero(np.isfinite(curve.values) & (curve.epochs < curve.diverged_at))
@@ -206,17 +206,17 @@ def count_label(shown: Band) -> str:
 
 
 def legend_title(statistic: Statistic) -> str:
-    """What the thick line, the band and the thin lines of `draw_band` are."""
+    """Return a legend title that explains the thick line, the band and the thin lines of `draw_band`."""
     return f"line and band: {statistic.words}; thin: single runs"
 
 
 def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = CEILING) -> tuple[float, float]:
-    """A logarithmic range for every value of the runs and of `others`; see style.log_limits."""
+    """Return logarithmic limits for all values of the runs and of `others`; see style.log_limits."""
     return style.log_limits(np.concatenate([*(shown.finite for shown in bands), np.array(others)]), ceiling)
 
 
 def linear_limits(bands: Sequence[Band]) -> tuple[float, float]:
-    """A range for every value of the runs, with a margin."""
+    """Return limits for all values of the runs, with a margin."""
     values = np.concatenate([shown.finite for shown in bands])
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0

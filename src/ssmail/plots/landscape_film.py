@@ -1,8 +1,8 @@
-"""Any run of a planar environment: the landscape of each agent after one epoch, and a film of how landscape and policy
-change over training. For questions that the paper's Figure 1 leaves open; the numbers are in the run's own units.
+"""Reward landscapes of any run on a planar environment: a picture of one epoch, or a film over training.
 
-Each panel is one agent's: its reward as its policy is given it (colours, with contour lines at tenths of the range that
-all panels and, in a film, all pictures share), the expert's trajectories and rollouts of the policy of that epoch.
+Each panel shows one agent: the reward that its policy receives (colors, with contour lines at tenths of the range), the
+expert's trajectories, and rollouts of that epoch's policy. All panels, and all frames of a film, share one range.
+Values are in the run's own units.
 """
 
 import io
@@ -22,17 +22,17 @@ from ssmail.plots.provenance import Provenance
 from ssmail.store import RunRow, Store
 
 LANDSCAPE, FILM = "landscape", "film"
-SECONDS = 0.7  # each picture of a film
-LAST = 2.5  # and its last one
+SECONDS = 0.7  # per frame of a film
+LAST = 2.5  # seconds of the last frame
 RESOLUTION = 150  # dots per inch of a film
 
 
 @dataclass(frozen=True, eq=False)
 class LandscapeRecord:
-    """The landscapes of one run, one of them for a picture and all of them for a film."""
+    """One landscape of a run for a picture, or all of them for a film."""
 
     run: RunRow
-    landscapes: tuple[Landscape, ...]  # of rising epochs
+    landscapes: tuple[Landscape, ...]  # in ascending order of epochs
     provenance: Provenance
     notes: tuple[str, ...]
 
@@ -61,7 +61,7 @@ class LandscapeRecord:
 
 
 def collect(store: Store, run_id: str, figure: str, epoch: int | None = None) -> LandscapeRecord:
-    """The landscapes of the run with this id: of `figure` "film" all, of "landscape" that of `epoch` (the last one).
+    """Collect the landscapes of a run: all of them for the figure "film", else that of `epoch` (by default the last).
 
     Raises InputError for an unknown id, a run without landscapes, and an epoch without one.
     """
@@ -69,7 +69,7 @@ def collect(store: Store, run_id: str, figure: str, epoch: int | None = None) ->
     epochs = landscape_grids.stored_epochs(store, run)
     if epoch is not None and epoch not in epochs:
         there = ", ".join(map(str, epochs))
-        raise InputError(f"run {run.name} stored no landscape of epoch {epoch}; those it has: {there}.")
+        raise InputError(f"run {run.name} stored no landscape of epoch {epoch}; choose one of {there}.")
     chosen = epochs if figure == FILM else [epochs[-1] if epoch is None else epoch]
     what = f"{run.method} on {run.environment}, seed {run.seed}, {run.state}"
     there = f"landscapes of epochs {', '.join(map(str, epochs))}"
@@ -82,13 +82,13 @@ def collect(store: Store, run_id: str, figure: str, epoch: int | None = None) ->
 
 
 def draw(record: LandscapeRecord) -> Figure:
-    """The first of the record's landscapes."""
+    """Draw the first landscape of the record."""
     with style.sheet():
         return _draw(record, record.landscapes[0], _limits(record.landscapes[:1]))
 
 
 def save_film(record: LandscapeRecord, outdir: Path) -> Path:
-    """Write an animated GIF of all landscapes, with the provenance as its comment; returns its path.
+    """Write an animated GIF of all landscapes, with the provenance as its comment, and return its path.
 
     Raises InputError for a folder that cannot be written.
     """
@@ -141,7 +141,7 @@ def _draw(record: LandscapeRecord, landscape: Landscape, limits: tuple[float, fl
 
 
 def _limits(landscapes: Sequence[Landscape]) -> tuple[float, float]:
-    """The lowest and the highest reward of any agent in any of them; a hair apart where all are equal."""
+    """Return the lowest and the highest reward of all agents and landscapes, slightly apart if they are equal."""
     low = min(float(landscape.reward.min()) for landscape in landscapes)
     high = max(float(landscape.reward.max()) for landscape in landscapes)
     return low, high if high > low else low + 1e-6

@@ -1,4 +1,4 @@
-"""Landscapes as a run stored them (docs/database.md): reading them, joining the planes of the agents, drawing one."""
+"""Landscapes as stored by a run (docs/database.md): read them, join the planes of the agents, and draw them."""
 
 import re
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, of a reward from 0 to
 
 @dataclass(frozen=True, eq=False)
 class Landscape:
-    """The reward that a run's policy climbed after one epoch. Positions are in the environment's own (raw) units."""
+    """The reward over the plane after one epoch of a run. Positions are in the environment's raw units."""
 
     epoch: int
     x: Floats  # (W,)
@@ -49,18 +49,18 @@ class Landscape:
         return owner
 
     def joined(self, values: Floats) -> Floats:
-        """(H, W) of (N, H, W): at each point the value of the agent that owns it."""
+        """Return (H, W) from values (N, H, W): at each point, the value of the agent that owns it."""
         joined: Floats = np.take_along_axis(values, self.owner[None], axis=0)[0]
         return joined
 
     def share(self, usable: float) -> float:
-        """The slope share (ssmail.evaluation.landscape) with another threshold than the stored metric has."""
+        """Return the slope share (ssmail.evaluation.landscape) for a threshold other than that of the stored metric."""
         scaled = Plane(self.plane.x / self.unit, self.plane.y / self.unit)
         return slope_share(self.reward, self.gradient, scaled, usable)
 
 
 def stored_epochs(store: Store, run: RunRow) -> list[int]:
-    """The epochs whose landscapes the run stored, rising. Raises InputError, with the remedy, when there is none."""
+    """Return the epochs whose landscapes the run stored, ascending. Raises InputError, with the remedy, for none."""
     epochs = _epochs(store.array_names(run.id))
     if not epochs:
         raise InputError(f"run {run.name} {_lack(run)}")
@@ -83,17 +83,17 @@ def _epochs(names: Sequence[str]) -> list[int]:
 
 
 def _lack(run: RunRow) -> str:
-    """Why a run has no landscape."""
+    """Say why a run has no landscape."""
     if not run.spec.get("adversarial"):
         return f"({run.method}) learns no reward, so it has no landscape; take one of ssail, gail or wail."
     if run.environment == "mocap":
-        return "is on mocap, which is no plane; landscapes are of planar environments."
+        return "is on mocap, which is not planar; only planar environments have landscapes."
     remedy = f"`ssmail train --method {run.method} --env {run.environment} --profile {run.profile} --resume never`"
-    return f"stored no landscape: it is older than they are, or was stopped before its first epoch; run {remedy}."
+    return f"stored no landscape: an older ssmail trained it, or it was stopped before its first epoch; run {remedy}."
 
 
 def read(store: Store, run: RunRow, epoch: int) -> Landscape:
-    """The landscape of that epoch, one of `stored_epochs`."""
+    """Read the landscape of an epoch, one of `stored_epochs`."""
 
     def array(name: str) -> Floats:
         values: Floats = store.array(run.id, f"landscape/{name}").astype(np.float64)
@@ -112,13 +112,13 @@ def read(store: Store, run: RunRow, epoch: int) -> Landscape:
 
 
 def normalised(reward: Floats) -> Floats:
-    """The reward from 0, its lowest value in the array, to 1, its highest; 0.5 where it is the same everywhere."""
+    """Rescale the reward to [0, 1]; a constant reward becomes 0.5."""
     low, span = reward.min(), np.ptp(reward)
     return (reward - low) / span if span > 0 else np.full_like(reward, 0.5)
 
 
 def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[float, float] = (0, 1)) -> AxesImage:
-    """(H, W) as colours, with contour lines at tenths of the limits: dense where it is steep."""
+    """Draw a reward (H, W) as colors, with contour lines at tenths of the limits."""
     edges = extent(landscape)
     image = axes.imshow(
         reward, origin="lower", extent=edges, cmap=MAP, vmin=limits[0], vmax=limits[1], interpolation="bilinear"
@@ -131,7 +131,7 @@ def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[
 
 
 def label_axes(grid: Sequence[Axes], columns: int, environment: str) -> None:
-    """Say what is on the axes, in the panels of the left column and of the lowest row, which come row by row."""
+    """Label the axes of the left column and of the bottom row; `grid` is in row-major order."""
     unit = f" ({UNITS[environment]})" if environment in UNITS else ""
     for place, axes in enumerate(grid):
         if place % columns == 0:
@@ -142,7 +142,7 @@ def label_axes(grid: Sequence[Axes], columns: int, environment: str) -> None:
 
 
 def frame(axes: Axes, landscape: Landscape) -> None:
-    """Limits and equal scales, without a grid."""
+    """Set limits and equal scales, without grid lines."""
     left, right, bottom, top = extent(landscape)
     axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.set_aspect("equal")
@@ -150,34 +150,34 @@ def frame(axes: Axes, landscape: Landscape) -> None:
 
 
 def extent(landscape: Landscape) -> tuple[float, float, float, float]:
-    """Left, right, bottom and top edge of the plane's cells."""
+    """Return the left, right, bottom and top edge of the plane's cells."""
     half = landscape.plane.spacing / 2
     x, y = landscape.x, landscape.y
     return float(x[0] - half), float(x[-1] + half), float(y[0] - half), float(y[-1] + half)
 
 
 def draw_paths(axes: Axes, trajectories: Floats, colour: str, **line: Any) -> None:
-    """(R, T, N, 2): a line for each agent of each trajectory."""
+    """Draw a line for each agent of each trajectory (R, T, N, 2)."""
     style_of = {"lw": 0.6, "solid_capstyle": "round", **line}
     for trajectory in trajectories:
         axes.plot(trajectory[..., 0], trajectory[..., 1], color=colour, **style_of)
 
 
 def path_rows(trajectories: Floats, **columns: object) -> pd.DataFrame:
-    """(R, T, N, 2) as rows of trajectory, agent, step, x, y after the constant `columns`."""
+    """Return trajectories (R, T, N, 2) as rows of trajectory, agent, step, x, y after the constant `columns`."""
     trajectory, step, agent = (index.ravel() for index in np.indices(trajectories.shape[:-1]))
     x, y = trajectories.reshape(-1, 2).T
     return pd.DataFrame({**columns, "trajectory": trajectory, "agent": agent, "step": step, "x": x, "y": y})
 
 
 def plane_rows(landscape: Landscape, values: Sequence[tuple[str, Floats]], **columns: object) -> pd.DataFrame:
-    """The points of the plane as rows of x, y and each named (H, W) of `values`."""
+    """Return the points of the plane as rows of x, y and each named array (H, W) of `values`."""
     x, y = np.meshgrid(landscape.x, landscape.y)
     named = {name: array.ravel() for name, array in values}
     return pd.DataFrame({**columns, "x": x.ravel(), "y": y.ravel(), **named})
 
 
 def height(landscape: Landscape, width: float, ceiling: float = 2.6) -> float:
-    """Inches that a panel of this width needs for equal scales."""
+    """Return the height in inches that a panel of this width needs for equal scales."""
     left, right, bottom, top = extent(landscape)
     return float(np.clip(width * (top - bottom) / (right - left), 0.5, ceiling))

@@ -1,4 +1,4 @@
-"""What stored metrics are called and measured in on an axis, and which of them are errors."""
+"""Units and axis labels of stored metrics, and which metrics are errors."""
 
 import re
 
@@ -23,13 +23,13 @@ ERRORS = frozenset({"mse", "mode_mse", "one_step_mse", "ade", "fde", "min_ade_20
 
 
 def label(metric: str) -> str:
-    """The metric ("train/mode_mse") as an axis names it: its stored name, and its unit on a second line."""
+    """Return the axis label of a metric ("train/mode_mse"): its stored name, with the unit on a second line."""
     unit = UNITS.get(_quantity(metric))
     return f"{metric}\n({unit})" if unit else metric
 
 
 def is_error(metric: str) -> bool:
-    """Whether smaller is better and 0 is the best there is, so that a diverged run counts as infinitely bad."""
+    """Return whether a metric is an error: 0 is best, and a diverged run counts as infinite."""
     return _quantity(metric) in ERRORS
 
 
@@ -39,5 +39,5 @@ def last_part(metric: str) -> str:
 
 
 def _quantity(metric: str) -> str:
-    """The last part, without the predicted step of a forecast: "test/mse_40" -> "mse"."""
+    """Return the last part without the predicted step of a forecast: "test/mse_40" -> "mse"."""
     return re.sub(r"^mse_\d+$", "mse", last_part(metric))

@@ -1,8 +1,8 @@
-"""The skeleton walking: poses of one window of a prepared motion-capture set, seen from the side.
+"""The walking skeleton: poses of one window of a prepared motion-capture set, seen from the side.
 
-The picture shows POSES of the window's frames, evenly spaced, each in a panel of its own but at one scale: along is the
-distance along the direction in which the root moves over the window, seen from the walker's right. The film (GIF) shows
-every STRIDE-th frame at SPEED times the speed of the recording.
+The picture shows POSES evenly spaced frames of the window, each in its own panel but all at one scale. The horizontal
+axis is the distance along the direction in which the root moves over the window, seen from the walker's right. The film
+(GIF) shows every STRIDE-th frame at SPEED times the speed of the recording.
 """
 
 import io
@@ -41,12 +41,12 @@ HEAD = "head"
 MARGIN = 1.2  # around the skeleton, in file units, of which a person has about 30
 TICK = 10.0
 HIGHEST = 5.0  # inches of a film
-STILL = 1e-6  # a root that moves less, in file units, does not say where it walks
+STILL = 1e-6  # file units; a root that moves less has no walking direction
 
 
 @dataclass(frozen=True, eq=False)
 class SkeletonRecord:
-    """Everything that the picture and the film show; lengths in the units of the .asf file."""
+    """The contents of the picture and the film. Lengths are in the units of the .asf file."""
 
     places: Floats  # (T, N, 2) of each joint: along the walk, height
     joints: tuple[str, ...]  # (N,)
@@ -66,7 +66,7 @@ class SkeletonRecord:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """(N,) a key of SIDES for the bone that ends in each joint."""
+        """Return (N,) keys of SIDES, one for the bone that ends in each joint."""
         return tuple(side(joint, self.joints) for joint in self.joints)
 
     def table(self) -> pd.DataFrame:
@@ -82,7 +82,7 @@ class SkeletonRecord:
 
 
 def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
-    """One window of the set that `ssmail prep-mocap` wrote to `path`.
+    """Collect one window of the set that `ssmail prep-mocap` wrote to `path`.
 
     Raises InputError when there is no such set, split or window.
     """
@@ -144,7 +144,7 @@ def seen_from_the_side(positions: Floats) -> Floats:
 
 
 def draw(record: SkeletonRecord) -> Figure:
-    """One panel for each pose, all at one scale and as wide as the widest pose needs."""
+    """Draw one panel for each pose, all at one scale and as wide as the widest pose."""
     poses = record.places[record.shown]
     half = max(float(np.ptp(pose[:, 0])) for pose in poses) / 2 + MARGIN
     heights = _heights(record)
@@ -210,7 +210,7 @@ def _film(record: SkeletonRecord) -> Iterator[Image.Image]:
 
 
 def _heights(record: SkeletonRecord) -> tuple[float, float]:
-    """Limits of the vertical axis: the ground, or what is below it, to above the head."""
+    """Return the limits of the vertical axis: from the ground, or the lowest joint, to above the head."""
     return min(0.0, float(record.places[..., 1].min())) - MARGIN, float(record.places[..., 1].max()) + 2 * MARGIN
 
 
@@ -225,7 +225,7 @@ def _prepare(axes: Axes, along: tuple[float, float], heights: tuple[float, float
 
 
 def _draw_pose(axes: Axes, record: SkeletonRecord, pose: Floats, thickness: float = 1.0) -> None:
-    """(N, 2): the ground, the bones, the far ones first, and the head."""
+    """Draw one pose (N, 2): the ground, the bones from far to near, and the head."""
     axes.axhline(0, color=style.LANE, lw=0.8, zorder=1, gid="ground")
     sides = record.sides
     for order, (name, stroke) in enumerate(SIDES.items()):

@@ -56,7 +56,7 @@ SHEET: dict[Any, Any] = {
 
 
 class Stroke(NamedTuple):
-    """How the lines of one group of runs are drawn."""
+    """Line style of one group of runs."""
 
     colour: str
     line: str
@@ -74,7 +74,7 @@ METHODS = {
 
 
 def strokes(labels: Sequence[str]) -> dict[str, Stroke]:
-    """A stroke for each label: a method's own, and for other labels those that are left, in order.
+    """Return a stroke for each label: a method's own, and the remaining strokes, in order, for other labels.
 
     Where they do not suffice, the other labels go from dark to light, in viridis, which colour-blind readers can order.
     """
@@ -97,14 +97,14 @@ def sheet() -> Iterator[None]:
 
 
 def new_figure(height: float) -> Figure:
-    """An empty Figure one column wide and `height` inches high, on the Agg canvas. Call it within `sheet()`."""
+    """Return an empty Figure, one column wide and `height` inches high, on the Agg canvas. Call it within `sheet()`."""
     figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
 def log_axis(axes: Axes, limits: tuple[float, float]) -> None:
-    """A logarithmic y axis of these limits; a fine grid within a few decades, where it is needed and legible."""
+    """Make the y axis logarithmic with these limits. A range of few decades gets a fine grid."""
     axes.set_yscale("log")
     axes.set_ylim(*limits)
     axes.yaxis.set_major_locator(LogLocator(numticks=8))
@@ -115,7 +115,7 @@ def log_axis(axes: Axes, limits: tuple[float, float]) -> None:
 
 
 def log_limits(values: Floats, ceiling: float = np.inf) -> tuple[float, float]:
-    """A logarithmic range of at least a decade for the positive finite ones of `values`, up to `ceiling`."""
+    """Return limits of at least a decade for the positive finite `values`, at most `ceiling`."""
     values = values[np.isfinite(values) & (values > 0)]
     if not len(values):
         return 1e-3, 1.0
@@ -124,7 +124,7 @@ def log_limits(values: Floats, ceiling: float = np.inf) -> tuple[float, float]:
 
 
 def cut_low(low: Floats, lowest: Floats) -> Floats:
-    """The lower ends of spreads as a logarithmic scale shows them: at most REACH times below the lowest run.
+    """Return the lower ends of spreads for a logarithmic scale: at most a factor REACH below the lowest run.
 
     It would draw an end at or below 0 infinitely deep. NaN and -inf, an end that there is not, stay.
     """
@@ -132,19 +132,19 @@ def cut_low(low: Floats, lowest: Floats) -> Floats:
 
 
 def epoch_axis(axes: Axes) -> None:
-    """An x axis of whole epochs."""
+    """Make the x axis one of whole epochs."""
     axes.set_xlabel("epoch")
     axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
 
 
 def draw_reference(axes: Axes, error: float) -> Line2D:
-    """The dotted line of what driving straight on costs; returned for the legend."""
+    """Draw the dotted line of constant velocity, and return it for the legend."""
     return axes.axhline(
         error, color=REFERENCE, lw=1.0, ls=":", label="constant velocity (test)", gid="constant-velocity"
     )
 
 
 def draw_cross(axes: Axes, x: npt.ArrayLike, y: npt.ArrayLike, colour: str) -> Line2D:
-    """A cross, whole also on the edge, for each run that diverged."""
+    """Draw a cross for each run that diverged; it is not clipped at the edge."""
     (crosses,) = axes.plot(x, y, "x", color=colour, ms=4.5, mew=1.1, clip_on=False, zorder=5)
     return crosses
