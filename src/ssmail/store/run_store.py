@@ -240,11 +240,10 @@ class Store:
 
     def array_names(self, run_id: str) -> list[str]:
         """Return the names of the run's arrays, sorted."""
-        names = schema.array.c.name
+        table = schema.array
+        query = select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)
         with reading(self._engine) as connection:
-            return list(
-                connection.execute(select(names).where(schema.array.c.run_id == run_id).order_by(names)).scalars()
-            )
+            return list(connection.execute(query).scalars())
 
     def artifacts(self, run_id: str) -> list[ArtifactRow]:
         """Return the files that the run recorded, by name."""

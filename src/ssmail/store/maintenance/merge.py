@@ -85,13 +85,17 @@ def merge(where: str | Path, other: str | Path) -> Merge:
         # after the transaction: exchange the checkpoints of runs that the target had before
         copies.place(item.run.id for item in merged if item.enters or item.fate is Fate.ALREADY_THERE)
         copies.commit()
-        copies.remove(_removed_runs(merged))
+        entered = [item.run.id for item in merged if item.enters]
+        copies.remove({run_id for item in merged for run_id in item.replaces}.difference(entered))
     except BaseException:
         copies.undo()
         raise
     finally:
         copies.close()
-    return Merge(target, source, tuple(merged), _without_checkpoints(target, merged))
+    with opened(target) as engine, reading(engine) as connection:
+        files = {run_id: queries.artifacts(connection, run_id, copies.target) for run_id in entered}
+    incomplete = tuple(run_id for run_id, rows in files.items() if any(fault_of(row) for row in rows))
+    return Merge(target, source, tuple(merged), incomplete)
 
 
 def _merge(source: Path, target: Path, copies: CheckpointCopies) -> list[MergedRun]:
@@ -171,16 +175,3 @@ def _wanted_folders(merged: Sequence[MergedRun], here: Connection, copies: Check
     there = [item.run.id for item in merged if item.fate is Fate.ALREADY_THERE]
     repaired = [run_id for run_id in there if not is_intact(run_id, copies.target) and is_intact(run_id, copies.source)]
     return [item.run.id for item in merged if item.enters] + repaired
-
-
-def _removed_runs(merged: Sequence[MergedRun]) -> set[str]:
-    """Return the ids of the replaced runs that are no longer in the target."""
-    entered = {item.run.id for item in merged if item.enters}
-    return {run_id for item in merged for run_id in item.replaces} - entered
-
-
-def _without_checkpoints(target: Path, merged: Sequence[MergedRun]) -> tuple[str, ...]:
-    with opened(target) as engine, reading(engine) as connection:
-        entered = [item.run.id for item in merged if item.enters]
-        files = {run_id: queries.artifacts(connection, run_id, checkpoint_root_of(target)) for run_id in entered}
-    return tuple(run_id for run_id, rows in files.items() if any(fault_of(row) for row in rows))
