@@ -1,9 +1,8 @@
 """`ssmail generate-yjunction`, `generate-letters` and `prep-mocap`: expert sets as files."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,7 +11,6 @@ from ssmail_cli.options import Json
 from ssmail_cli.output import note, write_json
 
 if TYPE_CHECKING:
-    from ssmail.config.sections import DataSpec
     from ssmail.data.trajectories import ExpertSet
 
 IN_FILE = "as in experiments.yaml"
@@ -27,6 +25,7 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite the file when it
 
 
 def generate_yjunction(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/yjunction.npz"),
     train: Train = None,
     validation: Validation = None,
@@ -50,20 +49,11 @@ def generate_yjunction(
     In each trajectory, agents in single file take one of two lanes. The .npz holds the three splits, their parameters
     and a hash. Train on it with --set data.path=FILE; without a file, training generates the default set itself.
     """
-    given = {
-        "train": train,
-        "validation": validation,
-        "test": test,
-        "agents": agents,
-        "steps": steps,
-        "lane_angle": lane_angle,
-        "jitter": jitter,
-        "seed": seed,
-    }
-    _write(_data("yjunction", given), out, force, as_json)
+    _generate("yjunction", ctx, out, force, as_json)
 
 
 def generate_letters(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/letters.npz"),
     word: Annotated[
         str | None,
@@ -87,16 +77,7 @@ def generate_letters(
     parameters and a hash. Train on it with --env letters --set data.path=FILE, or without a file on another word with
     --env letters --set data.letters.word=WORD.
     """
-    given = {
-        "word": word,
-        "train": train,
-        "validation": validation,
-        "test": test,
-        "steps": steps,
-        "jitter": jitter,
-        "seed": seed,
-    }
-    _write(_data("letters", given), out, force, as_json)
+    _generate("letters", ctx, out, force, as_json)
 
 
 def prep_mocap(
@@ -119,7 +100,7 @@ def prep_mocap(
     allow_missing: Annotated[
         bool, typer.Option("--allow-missing", help="Continue without trials that do not exist.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Prepare the Noisy Mocap expert set from files of the CMU motion capture database.
@@ -151,18 +132,18 @@ def prep_mocap(
     _print_set(experts, out, as_json)
 
 
-def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
-    """Return the data section of experiments.yaml with the given options. Raises InputError for an invalid one."""
+def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_json: bool) -> None:
+    """Generate the set of experiments.yaml with the given options, which are named like the keys of its section.
+
+    Raises InputError for an invalid option.
+    """
     from ssmail.config.experiments import build_spec
     from ssmail.config.spec import METHODS
-
-    overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
-    return build_spec(METHODS[0], environment, "quick", overrides, source="the options").data
-
-
-def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
     from ssmail.data import expert_sets
 
+    given = {key: value for key, value in ctx.params.items() if key not in ("out", "force", "as_json")}
+    overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
+    data = build_spec(METHODS[0], environment, "quick", overrides, source="the options").data
     experts = expert_sets.generate(data)
     expert_sets.save(experts, out, force=force)
     if as_json:

@@ -106,21 +106,15 @@ def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0))
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
         table.add_column(heading, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
     for row in rows:
-        table.add_row(*(_plain(short(row.get(key), digits)) for key in columns))
+        table.add_row(*(Text(short(row.get(key), digits)) for key in columns))  # unlike a str, not read as markup
     return table
-
-
-def _plain(text: str) -> Any:
-    """Return text that Rich does not read as markup."""
-    from rich.text import Text
-
-    return Text(text)
 
 
 def _csv_cell(value: Any) -> Any:

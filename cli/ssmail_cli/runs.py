@@ -14,6 +14,8 @@ from ssmail_cli.output import Format, chosen_format, note, print_rows, print_tab
 from ssmail_cli.run_table import environment_metrics, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from ssmail.store import RunRow, Store
     from ssmail.store.comparison import Comparison
 
@@ -144,9 +146,12 @@ def export(
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if as_json or form is Format.JSON:
-        write_json([{**run_row(run), "spec": run.spec, "metrics": _metrics(store, run)} for run in runs], out)
+        write_json(
+            [{**run_row(run), "spec": run.spec, "metrics": _values(store.metrics([run.id]))} for run in runs], out
+        )
     else:
-        write_csv(_export_rows(store, runs), EXPORT_COLUMNS, out)
+        rows = ({"run_id": run.id, **run_row(run), **item} for run in runs for item in _values(store.metrics([run.id])))
+        write_csv(rows, EXPORT_COLUMNS, out)
     note(f"exported {counted(len(runs), 'run')}{f' to {out}' if out else ''}")
 
 
@@ -175,28 +180,16 @@ def delete(
     note(f"deleted {names}")
 
 
-def _metrics(store: "Store", run: "RunRow") -> list[dict[str, Any]]:
-    """Return every recorded value of a run: name, step, value."""
-    frame = store.metrics([run.id])
-    return [
-        {"name": name, "step": step, "value": value}
-        for name, step, value in zip(*(frame[key].tolist() for key in ("name", "step", "value")), strict=True)
-    ]
-
-
-def _export_rows(store: "Store", runs: "list[RunRow]") -> Iterator[dict[str, Any]]:
-    for run in runs:
-        columns = {"run_id": run.id, **run_row(run)}
-        yield from ({**columns, **value} for value in _metrics(store, run))
+def _values(metrics: "DataFrame") -> list[dict[Any, Any]]:
+    """Return the recorded values of a run: name, step, value."""
+    return metrics[["name", "step", "value"]].to_dict("records")
 
 
 def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
-    latest = store.latest_metrics([run.id])
-    metrics = zip(*(latest[key].tolist() for key in ("name", "step", "value")), strict=True)
     return {
         "run": run_row(run),
         "spec": run.spec,
-        "metrics": [{"name": name, "step": step, "value": value} for name, step, value in metrics],
+        "metrics": _values(store.latest_metrics([run.id])),
         "arrays": store.array_names(run.id),
         "artifacts": [
             {"name": item.name, "path": item.path, "sha256": item.sha256, "size_bytes": item.size_bytes}
