@@ -155,11 +155,12 @@ def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_j
 
 def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
     """Print what was written, and on stderr the trials that are missing."""
-    splits = {"train": experts.train, "validation": experts.validation, "test": experts.test}
-    windows = {name: len(split) for name, split in splits.items()}
-    scaling = experts.scaling
-    positions = scaling.position_min, scaling.position_max
-    velocities = scaling.velocity_min, scaling.velocity_max
+    windows = [len(split) for split in (experts.train, experts.validation, experts.test)]
+    found = experts.scaling
+    scaling = {
+        "positions": (found.position_min, found.position_max),
+        "velocities": (found.velocity_min, found.velocity_max),
+    }
     missing = experts.parameters["missing"]
     assert isinstance(missing, list)
     if as_json:
@@ -167,8 +168,8 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
             {
                 "path": out,
                 "hash": experts.hash,
-                "windows": windows,
-                "scaling": {"positions": positions, "velocities": velocities},
+                "windows": dict(zip(("train", "validation", "test"), windows, strict=True)),
+                "scaling": scaling,
                 "joints": experts.joints,
                 "missing": missing,
                 "parameters": experts.parameters,
@@ -178,10 +179,10 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
         )
     else:
         typer.echo(
-            f"wrote {out}: {'/'.join(map(str, windows.values()))} training/validation/test windows of "
+            f"wrote {out}: {'/'.join(map(str, windows))} training/validation/test windows of "
             f"{len(experts.joints)} joints, hash {experts.hash[:16]}"
         )
-        for what, (low, high) in (("positions", positions), ("velocities", velocities)):
+        for what, (low, high) in scaling.items():
             typer.echo(f"training {what} from {low:#.6g} to {high:#.6g}")
     if missing:
         trials = ", ".join(f"{trial:02d}" for trial in missing)
