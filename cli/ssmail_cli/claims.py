@@ -62,7 +62,7 @@ def claims(
         for remark in found.notes:
             note(f"{found.claim.name}: {remark}")
     if kind is Format.CSV:
-        print_rows([row for found in judgements for row in _part_rows(found)], dict.fromkeys(_PART_COLUMNS, ""), kind)
+        print_rows([row for found in judgements for row in _part_rows(found)], {}, kind)
         return
     for found in judgements:
         typer.echo("\n".join([*_claim_lines(found), ""]))
@@ -70,14 +70,7 @@ def claims(
     typer.echo("\n".join(_wrapped(LEGEND, 0)))
 
 
-_PART_COLUMNS = (
-    *("claim", "alias", "claim_verdict", "claim_p", "claim_p_holm", "statement", "verdict", "effect", "low", "high"),
-    *("effect_is", "p_for", "p_against", "more_seeds", "reason", "statistic", "test", "samples"),
-)
-
-
 def _summary(found: "Judgement") -> dict[str, Any]:
-    """Return a claim as a row of the summary."""
     decision = found.decision
     unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
@@ -92,7 +85,6 @@ def _summary(found: "Judgement") -> dict[str, Any]:
 
 
 def _as_json(found: "Judgement") -> dict[str, Any]:
-    """Return everything about a claim, for JSON."""
     claim, decision = found.claim, found.decision
     return {
         "claim": claim.name,
@@ -142,7 +134,6 @@ def _part_rows(found: "Judgement") -> Iterator[dict[str, Any]]:
 
 
 def _claim_lines(found: "Judgement") -> list[str]:
-    """Return a claim as lines of text."""
     claim = found.claim
     lines = [f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}"]
     lines += _wrapped(claim.sentence, 2)
@@ -156,11 +147,8 @@ def _claim_lines(found: "Judgement") -> list[str]:
 
 
 def _part_lines(part: "Part") -> list[str]:
-    lines = [
-        f"  - {part.statement}: {part.verdict}{_lack(part)}",
-        *_wrapped(part.statistic, 6),
-        *_wrapped(part.test, 6),
-    ]
+    lines = [f"  - {part.statement}: {part.verdict}{_lack(part)}"]
+    lines += _wrapped(part.statistic, 6) + _wrapped(part.test, 6)
     if not part.reason:
         value, low, high = (short(float(number), 3) for number in part.effect)
         chances = f"p = {short(part.p_for, 2)} in favour, {short(part.p_against, 2)} against"
@@ -180,7 +168,6 @@ def _lack(part: "Part") -> str:
 
 
 def _seeds(sample: "Sample") -> str:
-    """Return the value of every seed."""
     pairs = zip(sample.seeds, sample.values, strict=True)
     values = ", ".join(f"{seed}: {'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in pairs)
     return f"{sample.label}, seed by seed: {values or 'no runs'}"

@@ -1,9 +1,8 @@
 """`ssmail generate-yjunction`, `generate-letters` and `prep-mocap`: expert sets as files."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,7 +11,6 @@ from ssmail_cli.options import Json
 from ssmail_cli.output import note, write_json
 
 if TYPE_CHECKING:
-    from ssmail.config.sections import DataSpec
     from ssmail.data.trajectories import ExpertSet
 
 IN_FILE = "as in experiments.yaml"
@@ -27,6 +25,7 @@ Force = Annotated[bool, typer.Option("--force", help="Overwrite the file when it
 
 
 def generate_yjunction(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/yjunction.npz"),
     train: Train = None,
     validation: Validation = None,
@@ -50,20 +49,11 @@ def generate_yjunction(
     In each trajectory, agents in single file take one of two lanes. The .npz holds the three splits, their parameters
     and a hash. Train on it with --set data.path=FILE; without a file, training generates the default set itself.
     """
-    given = {
-        "train": train,
-        "validation": validation,
-        "test": test,
-        "agents": agents,
-        "steps": steps,
-        "lane_angle": lane_angle,
-        "jitter": jitter,
-        "seed": seed,
-    }
-    _write(_data("yjunction", given), out, force, as_json)
+    _generate("yjunction", ctx, out, force, as_json)
 
 
 def generate_letters(
+    ctx: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/letters.npz"),
     word: Annotated[
         str | None,
@@ -87,16 +77,7 @@ def generate_letters(
     parameters and a hash. Train on it with --env letters --set data.path=FILE, or without a file on another word with
     --env letters --set data.letters.word=WORD.
     """
-    given = {
-        "word": word,
-        "train": train,
-        "validation": validation,
-        "test": test,
-        "steps": steps,
-        "jitter": jitter,
-        "seed": seed,
-    }
-    _write(_data("letters", given), out, force, as_json)
+    _generate("letters", ctx, out, force, as_json)
 
 
 def prep_mocap(
@@ -119,7 +100,7 @@ def prep_mocap(
     allow_missing: Annotated[
         bool, typer.Option("--allow-missing", help="Continue without trials that do not exist.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Prepare the Noisy Mocap expert set from files of the CMU motion capture database.
@@ -151,18 +132,18 @@ def prep_mocap(
     _print_set(experts, out, as_json)
 
 
-def _data(environment: str, given: Mapping[str, Any]) -> "DataSpec":
-    """Return the data section of experiments.yaml with the given options. Raises InputError for an invalid one."""
+def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_json: bool) -> None:
+    """Generate the set of experiments.yaml with the given options, which are named like the keys of its section.
+
+    Raises InputError for an invalid option.
+    """
     from ssmail.config.experiments import build_spec
     from ssmail.config.spec import METHODS
-
-    overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
-    return build_spec(METHODS[0], environment, "quick", overrides, source="the options").data
-
-
-def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
     from ssmail.data import expert_sets
 
+    given = {key: value for key, value in ctx.params.items() if key not in ("out", "force", "as_json")}
+    overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
+    data = build_spec(METHODS[0], environment, "quick", overrides, source="the options").data
     experts = expert_sets.generate(data)
     expert_sets.save(experts, out, force=force)
     if as_json:
@@ -174,11 +155,12 @@ def _write(data: "DataSpec", out: Path, force: bool, as_json: bool) -> None:
 
 def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
     """Print what was written, and on stderr the trials that are missing."""
-    splits = {"train": experts.train, "validation": experts.validation, "test": experts.test}
-    windows = {name: len(split) for name, split in splits.items()}
-    scaling = experts.scaling
-    positions = scaling.position_min, scaling.position_max
-    velocities = scaling.velocity_min, scaling.velocity_max
+    windows = [len(split) for split in (experts.train, experts.validation, experts.test)]
+    found = experts.scaling
+    scaling = {
+        "positions": (found.position_min, found.position_max),
+        "velocities": (found.velocity_min, found.velocity_max),
+    }
     missing = experts.parameters["missing"]
     assert isinstance(missing, list)
     if as_json:
@@ -186,8 +168,8 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
             {
                 "path": out,
                 "hash": experts.hash,
-                "windows": windows,
-                "scaling": {"positions": positions, "velocities": velocities},
+                "windows": dict(zip(("train", "validation", "test"), windows, strict=True)),
+                "scaling": scaling,
                 "joints": experts.joints,
                 "missing": missing,
                 "parameters": experts.parameters,
@@ -197,10 +179,10 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
         )
     else:
         typer.echo(
-            f"wrote {out}: {'/'.join(map(str, windows.values()))} training/validation/test windows of "
+            f"wrote {out}: {'/'.join(map(str, windows))} training/validation/test windows of "
             f"{len(experts.joints)} joints, hash {experts.hash[:16]}"
         )
-        for what, (low, high) in (("positions", positions), ("velocities", velocities)):
+        for what, (low, high) in scaling.items():
             typer.echo(f"training {what} from {low:#.6g} to {high:#.6g}")
     if missing:
         trials = ", ".join(f"{trial:02d}" for trial in missing)

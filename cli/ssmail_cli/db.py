@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -119,7 +119,11 @@ def merge(
 
     done = merge_databases(db, other)
     if as_json:
-        write_json(_merge_json(done), None)
+        runs = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.runs]
+        differences = [asdict(difference) for difference in done.differences]
+        names = {"target": done.target, "other": done.other}
+        without = done.without_checkpoints
+        write_json({**names, "runs": runs, "differences": differences, "without_checkpoints": without}, None)
         return
     for difference in done.differences:
         print(_difference(difference))
@@ -206,13 +210,6 @@ def _difference(found: "Difference") -> str:
         f"{found.metric}{where} is {kept} in run {found.kept[:8]}, which is kept, and {left_out} in run "
         f"{found.left_out[:8]}, which is left out"
     )
-
-
-def _merge_json(done: "Merge") -> dict[str, Any]:
-    runs = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.runs]
-    differences = [asdict(difference) for difference in done.differences]
-    names = {"target": done.target, "other": done.other}
-    return {**names, "runs": runs, "differences": differences, "without_checkpoints": done.without_checkpoints}
 
 
 def _print_export(done: "Compact", needed: "Contents", others: int) -> None:

@@ -5,11 +5,12 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from ssmail.errors import InputError, SsmailError
 
@@ -61,18 +62,16 @@ def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) ->
 
 def write_csv(rows: Iterable[Row], columns: Sequence[str], out: Path | None) -> None:
     """Write CSV with a header to a file, or to stdout (None). None becomes empty, NaN nan, a time ISO 8601."""
-
-    def write(file: Any) -> None:
+    with _opened(out) as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns)
         writer.writerows([_csv_cell(row.get(column)) for column in columns] for row in rows)
 
-    _write_to(out, write)
-
 
 def write_json(value: Any, out: Path | None) -> None:
     """Write JSON to a file, or to stdout (None). NaN and infinities become the strings nan, inf and -inf."""
-    _write_to(out, lambda file: print(json.dumps(_json_value(value), indent=2), file=file))
+    with _opened(out) as file:
+        print(json.dumps(_json_value(value), indent=2), file=file)
 
 
 def short(value: Any, digits: int = 4) -> str:
@@ -106,27 +105,20 @@ def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0))
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
         table.add_column(heading, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
     for row in rows:
-        table.add_row(*(_plain(short(row.get(key), digits)) for key in columns))
+        table.add_row(*(Text(short(row.get(key), digits)) for key in columns))  # unlike a str, not read as markup
     return table
 
 
-def _plain(text: str) -> Any:
-    """Return text that Rich does not read as markup."""
-    from rich.text import Text
-
-    return Text(text)
-
-
 def _csv_cell(value: Any) -> Any:
-    if isinstance(value, datetime):
-        return value.isoformat(timespec="seconds")
-    return json.dumps(_json_value(value)) if isinstance(value, Mapping | list | tuple) else value
+    plain = _json_value(value)
+    return json.dumps(plain) if isinstance(plain, dict | list) else plain
 
 
 def _json_value(value: Any) -> Any:
@@ -141,13 +133,15 @@ def _json_value(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def _write_to(out: Path | None, write: Any) -> None:
+@contextmanager
+def _opened(out: Path | None) -> Iterator[TextIO]:
+    """Open a file to write, or stdout (None). Raises InputError when it cannot be written."""
     if out is None:
-        write(sys.stdout)
+        yield sys.stdout
         return
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with out.open("w", encoding="utf-8", newline="") as file:
-            write(file)
+            yield file
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}; choose another --out.") from None

@@ -1,12 +1,12 @@
 """`ssmail plot`: a command for each thing that is drawn, with the options of its own."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.paper.results import FIGURES
@@ -88,12 +88,12 @@ class FigureGroup(TyperGroup):
 
     def _options_of(self, name: str, names: Sequence[str], given: dict[str, list[str]]) -> list[str]:
         """Return the tokens for one of the commands: all but SHARED options that only others of them have."""
-
-        def has(command: str, key: str) -> bool:
-            parameters = self.commands[command].params if command in self.commands else []
-            return any(key in parameter.opts for parameter in parameters)
-
-        for_others = {key for key in self.SHARED if not has(name, key) and any(has(other, key) for other in names)}
+        options = {
+            other: {key for parameter in self.commands[other].params for key in parameter.opts}
+            for other in names
+            if other in self.commands
+        }
+        for_others = self.SHARED & set().union(*options.values()) - options.get(name, set())
         return [token for key, tokens in given.items() if key not in for_others for token in tokens]
 
 
@@ -153,19 +153,16 @@ OneRun = Annotated[
 ]
 
 
-def figure(ctx: typer.Context, runs: FigureRuns = None, profile: options.Profile = None) -> None:
-    """Draw a figure without a centre and band."""
-    _draw_figure(ctx, runs, profile, None, None)
+class FigureCommand(TyperCommand):
+    """The command of a figure of the paper, without the options that the figure does not have."""
+
+    def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
+        module = FIGURES[name]
+        lacks = {"environment": not module.has_environment, "stat": not module.has_statistic}
+        super().__init__(name, params=[item for item in params if not lacks.get(item.name)], **settings)
 
 
-def figure_with_statistic(
-    ctx: typer.Context, runs: FigureRuns = None, profile: options.Profile = None, stat: options.Stat = None
-) -> None:
-    """Draw a figure with a centre and band."""
-    _draw_figure(ctx, runs, profile, stat, None)
-
-
-def figure_on_environment(
+def figure(
     ctx: typer.Context,
     environment: Annotated[
         str | None, typer.Option("--env", help="Draw the runs on this environment.", show_default="the paper's")
@@ -173,26 +170,6 @@ def figure_on_environment(
     runs: FigureRuns = None,
     profile: options.Profile = None,
     stat: options.Stat = None,
-) -> None:
-    """Draw a figure with a centre and band, if asked on another environment than the paper's."""
-    _draw_figure(ctx, runs, profile, stat, environment)
-
-
-def _add_figures() -> None:
-    """Add a command for each figure of the paper, with the options that the figure has."""
-    for module in dict.fromkeys(FIGURES.values()):
-        command: Callable[..., None] = figure_with_statistic if module.has_statistic else figure
-        if module.has_environment:
-            command = figure_on_environment
-        summary = f"({module.alias}) {module.summary[0].upper()}{module.summary[1:]}."
-        app.command(module.name, help=summary, epilog=EPILOG)(command)
-
-
-_add_figures()
-
-
-def _draw_figure(
-    ctx: typer.Context, runs: Sequence[str] | None, profile: str | None, stat: str | None, environment: str | None
 ) -> None:
     """Draw the figure that the command is called like."""
     from ssmail.config.experiments import figure_requirements
@@ -204,6 +181,11 @@ def _draw_figure(
     record = module.collect(store, runs, profile=profile, statistic=statistic, environment=environment)
     elsewhere = environment not in (None, figure_requirements(module.name).environment)
     to.save(module.name, f"{module.stem}_{environment}" if elsewhere else module.stem, record, module.draw(record))
+
+
+for _module in dict.fromkeys(FIGURES.values()):
+    _summary = f"({_module.alias}) {_module.summary[0].upper()}{_module.summary[1:]}."
+    app.command(_module.name, cls=FigureCommand, help=_summary, epilog=EPILOG)(figure)
 
 
 @app.command(ALL, epilog=EPILOG)
@@ -250,19 +232,13 @@ def training(
     from ssmail.plots import training_curves
 
     statistic, store = parse_statistic(stat) or Statistic.MEAN_STD, open_store(ctx.obj.db)
-    chosen = _training_runs(store, runs, methods, environment, profile)
+    chosen = _training_runs(store, methods, ids=runs, environment=environment, profile=profile)
     metrics = metrics or list(dict.fromkeys(environment_metrics(run.environment).curve for run in chosen))
     record = training_curves.collect(store, chosen, metrics, group_by, statistic)
     ctx.obj.save("training", record.stem, record, training_curves.draw(record))
 
 
-def _training_runs(
-    store: "Store",
-    ids: Sequence[str] | None,
-    methods: Sequence[str] | None,
-    environment: str | None,
-    profile: str | None,
-) -> "list[RunRow]":
+def _training_runs(store: "Store", methods: Sequence[str] | None, **conditions: Any) -> "list[RunRow]":
     """Return the runs that meet every condition, newest last. Raises InputError for an unknown method or no run."""
     from ssmail.config.experiments_file import load_experiments
 
@@ -270,8 +246,7 @@ def _training_runs(
         known = {run.method for run in store.runs()} | set(load_experiments().methods)
         if method not in known:
             raise unknown_name("method", method, sorted(known))
-    runs = store.runs(ids=ids, environment=environment, profile=profile)
-    runs = [run for run in runs if methods is None or run.method in methods]
+    runs = [run for run in store.runs(**conditions) if methods is None or run.method in methods]
     if not runs:
         raise InputError(f"no run in {store.where} meets these conditions; `ssmail runs list` shows those there are.")
     return runs

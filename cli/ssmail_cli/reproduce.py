@@ -89,9 +89,15 @@ def reproduce(
         for name, cells in figures.items()
     ]
     command = f"ssmail reproduce --profile {profile} --seeds {seeds} --db {db}"
-    reported = only is not None or _write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
+    failed = any(figure.lacks for figure in drawn if figure.name not in data.missing)
+    if only is None:
+        try:
+            write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
+        except Exception as error:  # the figures are drawn already
+            note(f"the report is not written: {error_line(error)}")
+            failed = True
     finish(sweep, rows)
-    if not reported or any(figure.lacks for figure in drawn if figure.name not in data.missing):
+    if failed:
         raise typer.Exit(ExitCode.FAILURE)
     if data.missing:
         raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
@@ -126,8 +132,7 @@ def _merged(sweeps: "Iterable[Sweep]") -> Sweep:
     """Return every cell once, under the names that it has where it comes first."""
     cells: dict[Cell, Any] = {}
     for sweep in sweeps:
-        for cell, names in sweep.items():
-            cells.setdefault(cell, names)
+        cells |= {cell: names for cell, names in sweep.items() if cell not in cells}
     return cells
 
 
@@ -170,17 +175,6 @@ def _absent_files(sweep: Sweep) -> set[tuple[str, str]]:
     return {(path, environment) for path, environment in needed if path is not None and not Path(path).exists()}
 
 
-def _make_data(figures: Mapping[str, Sweep], data: _Data, cmu: Path | None) -> None:
-    """Make the sets of recorded walking that can be made, with the defaults of `ssmail prep-mocap`.
-
-    Raises InputError when a file of the CMU database is missing or damaged.
-    """
-    paths = {path for name in data.made for path, _ in _absent_files(figures[name])}
-    for path in sorted(paths):
-        with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
-            prep_mocap(source=cmu, out=Path(path))
-
-
 def _trainable(figures: Mapping[str, Sweep], data: _Data) -> Sweep:
     """Return the cells whose data exists or will be made."""
     return _merged(cells for name, cells in figures.items() if name not in data.missing)
@@ -189,30 +183,30 @@ def _trainable(figures: Mapping[str, Sweep], data: _Data) -> Sweep:
 def _train(
     figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
 ) -> "tuple[Store, Sweep, Rows]":
-    """Make the data and compute every cell, the longest first. Raises typer.Exit when interrupted."""
+    """Make the data and compute every cell, the longest first.
+
+    The data has the defaults of `ssmail prep-mocap`. Raises InputError when a file of the CMU database is missing or
+    damaged, and typer.Exit when interrupted.
+    """
+    from ssmail.execution.local import wait_for_others
     from ssmail.execution.planning import check_labels, longest_first
     from ssmail.store import Store
-
-    needed = _trainable(figures, data)
-    sweep = {cell: needed[cell] for cell in longest_first(list(needed), _seconds(needed, db))}
-    check_labels(sweep)
-    _make_data(figures, data, cmu)
-    store = Store.open(db)
-    _wait_for_others(store, sweep)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
-    if is_interrupted(rows):
-        finish(sweep, rows)
-    return store, sweep, rows
-
-
-def _wait_for_others(store: "Store", sweep: Sweep) -> None:
-    """Wait for the processes of a reproduction that was killed a moment ago to end."""
-    from ssmail.execution.local import wait_for_others
 
     def on_wait(run: "RunRow") -> None:
         note(f"waiting up to half a minute for another process, running or recently killed, to release run {run.name}")
 
+    needed = _trainable(figures, data)
+    sweep = {cell: needed[cell] for cell in longest_first(list(needed), _seconds(needed, db))}
+    check_labels(sweep)
+    for path in sorted({path for name in data.made for path, _ in _absent_files(figures[name])}):
+        with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
+            prep_mocap(source=cmu, out=Path(path))
+    store = Store.open(db)
     wait_for_others(store, sweep, on_wait)
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
+    if is_interrupted(rows):
+        finish(sweep, rows)
+    return store, sweep, rows
 
 
 def _settled_runs(
@@ -292,15 +286,3 @@ def _draw(
     if len(ids) < len(cells):
         note(f"{name}: {len(cells) - len(ids)} of its {len(cells)} runs are missing: not finished.")
     return draw_or_report(name, store, ids, out, formats, None, statistic)
-
-
-def _write_report(
-    store: "Store", figures: "Sequence[Drawn]", out: Path, command: str, profile: str, unfinished: Sequence[str]
-) -> bool:
-    """Write the report; return whether that worked."""
-    try:
-        write_report(store, figures, out, command, profile, unfinished)
-    except Exception as error:  # the figures are drawn already
-        note(f"the report is not written: {error_line(error)}")
-        return False
-    return True

@@ -1,6 +1,6 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +14,8 @@ from ssmail_cli.output import Format, chosen_format, note, print_rows, print_tab
 from ssmail_cli.run_table import environment_metrics, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from ssmail.store import RunRow, Store
     from ssmail.store.comparison import Comparison
 
@@ -56,7 +58,12 @@ def list_runs(
     rows = rows_with_metrics(store, runs, errors)
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
-        _print_list(rows, errors)
+        short_rows = [
+            {**row, "spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
+            for row in rows
+        ]
+        heading = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
+        print_table(short_rows, {**RUN_COLUMNS, "error": heading})
     else:
         print_rows(rows, {**RUN_COLUMNS, **dict.fromkeys(errors, "")}, kind)
 
@@ -144,9 +151,12 @@ def export(
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if as_json or form is Format.JSON:
-        write_json([{**run_row(run), "spec": run.spec, "metrics": _metrics(store, run)} for run in runs], out)
+        write_json(
+            [{**run_row(run), "spec": run.spec, "metrics": _values(store.metrics([run.id]))} for run in runs], out
+        )
     else:
-        write_csv(_export_rows(store, runs), EXPORT_COLUMNS, out)
+        rows = ({"run_id": run.id, **run_row(run), **item} for run in runs for item in _values(store.metrics([run.id])))
+        write_csv(rows, EXPORT_COLUMNS, out)
     note(f"exported {counted(len(runs), 'run')}{f' to {out}' if out else ''}")
 
 
@@ -175,28 +185,16 @@ def delete(
     note(f"deleted {names}")
 
 
-def _metrics(store: "Store", run: "RunRow") -> list[dict[str, Any]]:
-    """Return every recorded value of a run: name, step, value."""
-    frame = store.metrics([run.id])
-    return [
-        {"name": name, "step": step, "value": value}
-        for name, step, value in zip(*(frame[key].tolist() for key in ("name", "step", "value")), strict=True)
-    ]
-
-
-def _export_rows(store: "Store", runs: "list[RunRow]") -> Iterator[dict[str, Any]]:
-    for run in runs:
-        columns = {"run_id": run.id, **run_row(run)}
-        yield from ({**columns, **value} for value in _metrics(store, run))
+def _values(metrics: "DataFrame") -> list[dict[Any, Any]]:
+    """Return the recorded values of a run: name, step, value."""
+    return metrics[["name", "step", "value"]].to_dict("records")
 
 
 def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
-    latest = store.latest_metrics([run.id])
-    metrics = zip(*(latest[key].tolist() for key in ("name", "step", "value")), strict=True)
     return {
         "run": run_row(run),
         "spec": run.spec,
-        "metrics": [{"name": name, "step": step, "value": value} for name, step, value in metrics],
+        "metrics": _values(store.latest_metrics([run.id])),
         "arrays": store.array_names(run.id),
         "artifacts": [
             {"name": item.name, "path": item.path, "sha256": item.sha256, "size_bytes": item.size_bytes}
@@ -218,16 +216,6 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"section": "array", "name": name, "step": None, "value": None}
     for item in details["artifacts"]:
         yield {"section": "artifact", "name": item["name"], "step": None, "value": item["path"]}
-
-
-def _print_list(rows: Sequence[Mapping[str, Any]], errors: Sequence[str]) -> None:
-    """Print one row per run; the test error, whose name depends on the environment, is one column."""
-    name = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
-    short_rows = [
-        {**row, "spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
-        for row in rows
-    ]
-    print_table(short_rows, {**RUN_COLUMNS, "error": name})
 
 
 def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] | None) -> "list[Comparison]":
@@ -252,14 +240,15 @@ def _headings(group: "list[Comparison]") -> dict[str, str]:
 
 def _print_comparisons(found: "list[Comparison]") -> None:
     """Print a table for each spec, with a row for each seed, mean, std and median and a column for each metric; then a
-    table of the specs of each environment.
+    table of the specs of each environment that has several.
     """
-    specs = _by_spec(found)
+    specs = [list(metrics) for _, metrics in groupby(found, key=lambda item: item.spec_hash)]
     for group in specs:
         first = group[0]
         rows: list[dict[str, Any]] = [
-            {"seed": _seed_label(first, seed), **{item.metric: item.values[seed] for item in group}}
-            for seed in first.values
+            {"seed": str(seed) if state == "finished" else f"{seed} {state}"}
+            | {item.metric: item.values[seed] for item in group}
+            for seed, state in first.states.items()
         ]
         for name in ("mean", "std", "median"):
             rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
@@ -267,24 +256,14 @@ def _print_comparisons(found: "list[Comparison]") -> None:
         print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
         print_table(rows, {"seed": "seed", **_headings(group)})
         print()
-    environments = dict.fromkeys(group[0].environment for group in specs)
-    overviews = [[group for group in specs if group[0].environment == name] for name in environments]
-    _print_overviews([alike for alike in overviews if len(alike) > 1])
-
-
-def _by_spec(found: "list[Comparison]") -> "list[list[Comparison]]":
-    """Group the comparisons of each spec (one per metric); they are consecutive."""
-    return [list(group) for _, group in groupby(found, key=lambda item: item.spec_hash)]
-
-
-def _print_overviews(environments: "list[list[list[Comparison]]]") -> None:
-    """Print a table for each environment, with a row for each spec; `seeds` counts those with the first metric."""
-    for number, specs in enumerate(environments):
-        where = specs[0][0].environment
-        between = "\n" if number else ""
-        print(f"{between}{where}: mean ± standard deviation; seeds: with the first metric, of all")
-        columns = {"spec": "spec", "seeds": "seeds", **_headings(specs[0])}
-        print_table([_overview_row(group) for group in specs], columns)
+    between = ""
+    for environment, groups in groupby(specs, key=lambda group: group[0].environment):
+        alike = list(groups)
+        if len(alike) > 1:
+            print(f"{between}{environment}: mean ± standard deviation; seeds: with the first metric, of all")
+            columns = {"spec": "spec", "seeds": "seeds", **_headings(alike[0])}
+            print_table([_overview_row(group) for group in alike], columns)
+            between = "\n"
 
 
 def _overview_row(group: "list[Comparison]") -> dict[str, Any]:
@@ -299,11 +278,6 @@ def _mean_and_std(item: "Comparison") -> str | None:
     if item.mean is None:
         return None
     return f"{item.mean:.3g}" if item.std is None else f"{item.mean:.3g} ± {item.std:.2g}"
-
-
-def _seed_label(item: "Comparison", seed: int) -> str:
-    state = item.states[seed].value
-    return str(seed) if state == "finished" else f"{seed} {state}"
 
 
 def _comparison_row(item: "Comparison", seeds: Sequence[int], kind: Format) -> dict[str, Any]:

@@ -45,7 +45,7 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
     """Return a row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
     runs = store.runs(ids=[event.run_id for event in events if event.run_id])
-    names = [*key_metrics(_environments(sweep)), "best_epoch"]
+    names = [*key_metrics(cell.spec.environment for cell in sweep), "best_epoch"]
     stored = {row["id"]: row for row in rows_with_metrics(store, runs, names)}
     return [
         {**names, "outcome": event.kind, "message": event.message}
@@ -112,12 +112,10 @@ def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | 
     return actions
 
 
-def _environments(sweep: Sweep) -> list[str]:
-    return list(dict.fromkeys(cell.spec.environment for cell in sweep))
-
-
 def _result_columns(sweep: Sweep) -> dict[str, str]:
-    metrics = {name: heading for name, heading in key_metrics(_environments(sweep)).items() if heading}
+    metrics = {
+        name: heading for name, heading in key_metrics(cell.spec.environment for cell in sweep).items() if heading
+    }
     return {"outcome": "outcome", "run": "run", **metrics, "wall_seconds": "seconds"}
 
 

@@ -5,6 +5,7 @@ from dataclasses import fields
 from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from ssmail.errors import InputError
 from ssmail.execution import Resume
@@ -13,19 +14,6 @@ from ssmail_cli import options
 from ssmail_cli.options import Device, parse_seeds, pick_device
 from ssmail_cli.output import note
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
-
-Values = Annotated[
-    str | None,
-    typer.Option(
-        "--values",
-        help="The values: 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once.",
-        show_default="those of experiments.yaml",
-    ),
-]
-AblationEnvironment = Annotated[
-    str | None,
-    typer.Option("--env", help="Train on this environment.", show_default="the ablation's in experiments.yaml"),
-]
 
 
 def train(
@@ -61,8 +49,18 @@ def ablate(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="alpha, beta, curriculum or label, or one of your experiments.yaml.")
     ],
-    values: Values = None,
-    environment: AblationEnvironment = None,
+    values: Annotated[
+        str | None,
+        typer.Option(
+            "--values",
+            help="The values: 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once.",
+            show_default="those of experiments.yaml",
+        ),
+    ] = None,
+    environment: Annotated[
+        str | None,
+        typer.Option("--env", help="Train on this environment.", show_default="the ablation's in experiments.yaml"),
+    ] = None,
     profile: options.TrainingProfile = "quick",
     seeds: options.Seeds = "0-4",
     jobs: options.Jobs = 1,
@@ -99,23 +97,16 @@ def ablate(
     finish(sweep, rows)
 
 
-def ablate_alias(
-    ctx: typer.Context,
-    values: Values = None,
-    environment: AblationEnvironment = None,
-    profile: options.TrainingProfile = "quick",
-    seeds: options.Seeds = "0-4",
-    jobs: options.Jobs = 1,
-    settings: options.Settings = None,
-    resume: options.ResumeOption = Resume.AUTO,
-    device: options.DeviceOption = Device.AUTO,
-    dry_run: options.DryRun = False,
-    as_json: options.Json = False,
-    db: options.Database = options.DEFAULT_DATABASE,
-) -> None:
-    """Run `ablate` under the name of an ablation: `ablate-beta` is `ablate beta`."""
-    name = str(ctx.info_name).removeprefix("ablate-")
-    ablate(name, values, environment, profile, seeds, jobs, settings, resume, device, dry_run, as_json, db)
+class AblateAlias(TyperCommand):
+    """The command `ablate-beta`: `ablate` without its argument NAME, which is "beta"."""
+
+    def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
+        super().__init__(name, params=[item for item in params if item.name != "name"], **settings)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run `ablate` with the name of the ablation."""
+        ctx.params["name"] = str(self.name).removeprefix("ablate-")
+        return super().invoke(ctx)
 
 
 def parse_values(text: str) -> list[Any]:

@@ -146,19 +146,12 @@ def _merge_layers(
     if method in METHODS and environment in ENVIRONMENTS:
         merged |= dict.fromkeys(set(OPTIONAL_SECTIONS) - set(required_sections(method, environment)))
         merged["data"] = {**merged.get("data", {}), **dict.fromkeys(set(GENERATED_ENVIRONMENTS) - {environment})}
-    label = flatten(merged).get(_LABEL)
-    if isinstance(label, str):
-        merged = merge(merged, _nested(_LABEL, _with_digest(label, experiments)))
+    if function := UserFunction.parse(flatten(merged).get(_LABEL)):
+        merged = merge(merged, _nested(_LABEL, function.with_digest(search_folders(experiments.path))))
     try:
         return RunSpec.model_validate({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
         raise InputError(explain(error, sources, str(experiments.path))) from None
-
-
-def _with_digest(label: Any, experiments: Experiments) -> Any:
-    """Return the name of a user function with the digest of its file, and any other label unchanged."""
-    function = UserFunction.parse(label)
-    return function.with_digest(search_folders(experiments.path)) if function else label
 
 
 def _read_ablation(experiments: Experiments, name: str, environment: str | None) -> Ablation:
@@ -177,7 +170,8 @@ def _read_ablation(experiments: Experiments, name: str, environment: str | None)
     values = entry["values"]
     if entry["key"] == _LABEL:
         with suppress(InputError):  # stored runs can be drawn without the files of their functions
-            values = [_with_digest(value, experiments) for value in values]
+            folders = search_folders(experiments.path)
+            values = [found.with_digest(folders) if (found := UserFunction.parse(value)) else value for value in values]
     return Ablation(name, entry["method"], environment, entry["key"], to_tuples(values))
 
 
@@ -201,7 +195,5 @@ def _override_layers(overrides: Sequence[str], method: str, environment: str, so
 
 def _nested(key: str, value: Any) -> dict[str, Any]:
     """Return a dotted key as nested mappings: ("a.b", 0.5) -> {"a": {"b": 0.5}}."""
-    for part in reversed(key.split(".")):
-        value = {part: value}
-    nested: dict[str, Any] = value
-    return nested
+    first, _, rest = key.partition(".")
+    return {first: _nested(rest, value) if rest else value}

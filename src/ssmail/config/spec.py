@@ -13,22 +13,7 @@ from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ValidationError, model_validator
 
-from ssmail.config import strict_yaml
-from ssmail.config.sections import (
-    AdversarialSpec,
-    CloningSpec,
-    CurriculumSpec,
-    DataSpec,
-    EvaluationSpec,
-    ForecastSpec,
-    Frozen,
-    ModelSpec,
-    SacSpec,
-    SelfSupervisionSpec,
-    TrainingSpec,
-    VariationalSpec,
-    WassersteinSpec,
-)
+from ssmail.config import sections, strict_yaml
 from ssmail.errors import InputError
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
@@ -66,24 +51,24 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
 _ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
 
 
-class RunSpec(Frozen):
+class RunSpec(sections.Frozen):
     """Everything that defines a run except its seed. Sections that it does not use are null (see METHOD_SECTIONS)."""
 
     method: Method
     environment: Environment
     profile: str
-    data: DataSpec
-    model: ModelSpec | None
-    adversarial: AdversarialSpec | None
-    self_supervision: SelfSupervisionSpec | None
-    wasserstein: WassersteinSpec | None
-    sac: SacSpec | None
-    variational: VariationalSpec | None
-    cloning: CloningSpec | None
-    curriculum: CurriculumSpec | None
-    training: TrainingSpec | None
-    evaluation: EvaluationSpec
-    forecast: ForecastSpec | None
+    data: sections.DataSpec
+    model: sections.ModelSpec | None
+    adversarial: sections.AdversarialSpec | None
+    self_supervision: sections.SelfSupervisionSpec | None
+    wasserstein: sections.WassersteinSpec | None
+    sac: sections.SacSpec | None
+    variational: sections.VariationalSpec | None
+    cloning: sections.CloningSpec | None
+    curriculum: sections.CurriculumSpec | None
+    training: sections.TrainingSpec | None
+    evaluation: sections.EvaluationSpec
+    forecast: sections.ForecastSpec | None
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
@@ -155,14 +140,14 @@ def check_keys(given: Mapping[str, Any], source: str) -> None:
 
     source: the place of the keys, as messages name it.
     """
-    sections = _spec_keys(RunSpec)
+    is_section = _spec_keys(RunSpec)
     for key, value in given.items():
         if key in _ARGUMENTS:
             raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
-        if key not in sections:
-            raise InputError(f"unknown key '{key}' in {source}; {_suggest_key(key, sections)}")
-        if sections[key] and not isinstance(value, Mapping):
-            first = next(other for other in sections if other.startswith(f"{key}."))
+        if key not in is_section:
+            raise InputError(f"unknown key '{key}' in {source}; {_suggest_key(key, is_section)}")
+        if is_section[key] and not isinstance(value, Mapping):
+            first = next(other for other in is_section if other.startswith(f"{key}."))
             what = f"{key} = {strict_yaml.inline(value)} in {source}"
             raise InputError(f"{what} is a section, not a value; set one of its keys such as {first}.")
 

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from ssmail.config.experiments_file import find_file
 from ssmail.config.shaping import FUNCTION
@@ -60,8 +60,7 @@ class UserFunction:
             names = [name for name, value in vars(module).items() if callable(value) and not name.startswith("_")]
             remedy = suggestion(self.name, names) if names else "define it there."
             raise InputError(f"{self}: {path} has no function {self.name}; {remedy}")
-        found: Callable[..., Any] = function
-        return found
+        return cast("Callable[..., Any]", function)
 
     def _locate(self, folders: Sequence[Path]) -> Path:
         inside = Path(*self.module.split("."))
@@ -133,12 +132,15 @@ def load_label(label: Any) -> "Callable[[Tensor], Tensor] | None":
     import torch  # not at the top: a plan must not wait for torch
 
     function = user_function.load(search_folders())
-    name = f"self_supervision.label: the function {user_function}"
+
+    def unusable(problem: str, remedy: str) -> InputError:
+        return InputError(f"self_supervision.label: the function {user_function} {problem}; {remedy}.")
+
     try:
         inspect.signature(function).bind(None)
     except TypeError as error:
         problem = f"cannot be called with one tensor of alphas ({_one_line(error)})"
-        raise InputError(f"{name} {problem}; let it take that.") from None
+        raise unusable(problem, "let it take that") from None
     except ValueError:  # it has no signature to inspect
         pass
 
@@ -147,19 +149,16 @@ def load_label(label: Any) -> "Callable[[Tensor], Tensor] | None":
             try:
                 labels = function(alpha.detach().cpu().clone())
             except Exception as error:
-                problem = f"raises {_one_line(error)}, given {len(alpha)} alphas"
-                raise InputError(f"{name} {problem}; correct it.") from error
+                raise unusable(f"raises {_one_line(error)}, given {len(alpha)} alphas", "correct it") from error
         if not isinstance(labels, torch.Tensor):
-            problem = f"returns {type(labels).__name__}, not a tensor"
-            raise InputError(f"{name} {problem}; return a label for each of its alphas.")
+            raise unusable(f"returns {type(labels).__name__}, not a tensor", "return a label for each of its alphas")
         if labels.shape != alpha.shape:
             problem = f"returns labels of shape {tuple(labels.shape)} for alphas of shape {tuple(alpha.shape)}"
-            raise InputError(f"{name} {problem}; return a label for each of them.")
+            raise unusable(problem, "return a label for each of them")
         labels = labels.detach().to(alpha)
         wrong = alpha[~labels.isfinite()]
         if len(wrong):
-            problem = f"returns NaN or infinity for alpha {float(wrong[0]):.4g}"
-            raise InputError(f"{name} {problem}; return finite labels.")
+            raise unusable(f"returns NaN or infinity for alpha {float(wrong[0]):.4g}", "return finite labels")
         return labels
 
     return label_function
