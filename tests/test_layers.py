@@ -58,6 +58,56 @@ def violations(source_root: Path) -> list[str]:
     return found
 
 
+def circles(source_root: Path) -> list[list[str]]:
+    """The groups of modules under `source_root` that import each other in a circle; packages' own files left out."""
+    files = {
+        ".".join(path.relative_to(source_root).with_suffix("").parts): path
+        for path in source_root.rglob("*.py")
+        if path.name != "__init__.py"
+    }
+    imports = {
+        name: {
+            found
+            for _, module in imported_modules(ast.parse(path.read_text()), name.rpartition(".")[0])
+            for found in (module, module.rpartition(".")[0])
+            if found in files and found != name
+        }
+        for name, path in files.items()
+    }
+    return [sorted(group) for group in _strongly_connected(imports) if len(group) > 1]
+
+
+def _strongly_connected(graph: dict[str, set[str]]) -> list[set[str]]:
+    """The strongly connected components: what reaches a node and is reached from it."""
+
+    def reached(start: str) -> set[str]:
+        found, waiting = {start}, [start]
+        while waiting:
+            for other in graph[waiting.pop()] - found:
+                found.add(other)
+                waiting.append(other)
+        return found
+
+    reach = {name: reached(name) for name in graph}
+    groups = {frozenset(other for other in reach[name] if name in reach[other]) for name in graph}
+    return [set(group) for group in groups]
+
+
+@pytest.mark.parametrize("source_root", [ROOT / "src", ROOT / "cli"], ids=lambda path: path.name)
+def test_no_modules_import_each_other_in_a_circle(source_root: Path) -> None:
+    assert circles(source_root) == []
+
+
+def test_a_planted_circle_is_caught(tmp_path: Path) -> None:
+    room = tmp_path / "ssmail" / "training"
+    room.mkdir(parents=True)
+    (room / "first.py").write_text("from ssmail.training.second import a\n")
+    (room / "second.py").write_text("from ssmail.training import third\n")
+    (room / "third.py").write_text("def late():\n    from ssmail.training.first import b\n")
+    (room / "fourth.py").write_text("from ssmail.training.third import late\n")
+    assert circles(tmp_path) == [["ssmail.training.first", "ssmail.training.second", "ssmail.training.third"]]
+
+
 @pytest.mark.parametrize("source_root", [ROOT / "src", ROOT / "cli"], ids=lambda path: path.name)
 def test_no_import_goes_upward(source_root: Path) -> None:
     assert list(source_root.rglob("*.py"))

@@ -9,10 +9,11 @@ import pandas as pd
 import pytest
 
 from ssmail.paper import fig5_modes
-from ssmail.paper.reads import USUAL_CURVES, Reads, contents
+from ssmail.paper.reads import USUAL_CURVES, contents
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.paper.samples import Runs
 from ssmail.plots import NoRuns
+from ssmail.plots.run_groups import Reads
 from ssmail.store import RunState, Store
 from ssmail.store.maintenance.compact import Wanted, export_compact, settled_cells
 

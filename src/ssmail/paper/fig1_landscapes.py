@@ -35,12 +35,11 @@ from ssmail.errors import InputError
 from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 

@@ -31,12 +31,11 @@ from ssmail.errors import InputError
 from ssmail.evaluation.landscape import Plane, cosines
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.formatting import setting
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.plots.series import figure_ablation, select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values

@@ -25,12 +25,11 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group
+from ssmail.plots.run_groups import Group, Reads
 from ssmail.plots.series import select
 from ssmail.store import Store
 

@@ -27,11 +27,11 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
 from ssmail.plots.provenance import Provenance
+from ssmail.plots.run_groups import Reads
 from ssmail.plots.series import select
 from ssmail.store import Store
 

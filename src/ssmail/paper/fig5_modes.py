@@ -27,11 +27,10 @@ from matplotlib.lines import Line2D
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection, check_settled
+from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values

@@ -28,12 +28,11 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
 from ssmail.plots.curves import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, check_settled
+from ssmail.plots.run_groups import Group, Reads, check_settled
 from ssmail.plots.series import figure_ablation, select
 from ssmail.store import Store
 

@@ -40,12 +40,11 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
-from ssmail.paper.reads import Reads
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Selection, check_settled
+from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 

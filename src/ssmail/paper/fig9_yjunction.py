@@ -17,9 +17,9 @@ from matplotlib.figure import Figure
 from ssmail.config.experiments import figure_requirements
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.errors import InputError
-from ssmail.paper.reads import Reads
 from ssmail.plots import NoRuns, style
 from ssmail.plots.provenance import Provenance
+from ssmail.plots.run_groups import Reads
 from ssmail.plots.series import train_command
 from ssmail.store import RunRow, Store
 

@@ -2,41 +2,18 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 from ssmail.errors import InputError
+from ssmail.paper.results import FIGURES, FigureModule
+from ssmail.plots.series import select
 from ssmail.store import RunRow, Store
 from ssmail.store.maintenance.compact import Thinning, Wanted
-
-if TYPE_CHECKING:
-    from ssmail.paper.results import FigureModule
 
 USUAL_CURVES = tuple(
     f"{split}/{error}" for split in ("train", "validation") for error in ("mode_mse", "mse", "stroke_distance")
 )
 """The errors of every epoch: kept for all runs, whether or not a figure reads them."""
-
-
-@dataclass(frozen=True)
-class Reads:
-    """What a figure and its claim read from a run, besides the last values of metrics.
-
-    curves: metrics that are read over the epochs. arrays: names of arrays, each with the Thinning that reduces it to
-    what the figure shows, or None when all of it is read; the figure shows the same from the thinned array. landscapes:
-    whether the first and the last stored landscape are read.
-    """
-
-    curves: tuple[str, ...] = ()
-    arrays: Mapping[str, Thinning | None] = field(default_factory=dict)
-    landscapes: bool = False
-
-    def stored(self, names: Sequence[str]) -> dict[str, Thinning | None]:
-        """Return those of a run's arrays (`names`, sorted) that are read."""
-        from ssmail.plots.landscape_grids import first_and_last  # imported here because it needs matplotlib
-
-        read = {name: thin for name, thin in self.arrays.items() if name in names}
-        return read | dict.fromkeys(first_and_last(names)) if self.landscapes else read
 
 
 @dataclass(frozen=True)
@@ -52,8 +29,6 @@ def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
 
     Figures are drawn, and claims judged, from any profile and from each, and where possible on each environment.
     """
-    from ssmail.paper.results import FIGURES
-
     only = store.only(run.id for run in runs)
     curves = set(USUAL_CURVES)
     arrays: dict[str, dict[str, Thinning | None]] = {}
@@ -65,7 +40,7 @@ def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
     return Contents(Wanted(frozenset(curves), arrays), undrawable)
 
 
-def _drawn(store: Store, figure: "FigureModule", runs: Sequence[RunRow], undrawable: dict[str, str]) -> Iterator[str]:
+def _drawn(store: Store, figure: FigureModule, runs: Sequence[RunRow], undrawable: dict[str, str]) -> Iterator[str]:
     """Yield the runs that the figure or its claim chooses; record in `undrawable` why it cannot be drawn by default."""
     environments = [None, *sorted({run.environment for run in runs})] if figure.has_environment else [None]
     for profile in (None, *sorted({run.profile for run in runs})):
@@ -78,10 +53,8 @@ def _drawn(store: Store, figure: "FigureModule", runs: Sequence[RunRow], undrawa
                 yield from _judged(store, figure, profile, environment)
 
 
-def _judged(store: Store, figure: "FigureModule", profile: str | None, environment: str | None) -> Iterator[str]:
+def _judged(store: Store, figure: FigureModule, profile: str | None, environment: str | None) -> Iterator[str]:
     """Yield the runs that the claim can be judged from although the figure cannot be drawn."""
-    from ssmail.plots.series import select
-
     together = {name for name, thin in figure.reads.arrays.items() if thin is not None}
     with suppress(InputError):
         for run in select(store, figure.name, profile=profile, environment=environment).runs:

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
     from ssmail.evaluation.statistics import Statistic
     from ssmail.paper.claims import Claim, Part
-    from ssmail.paper.reads import Reads
     from ssmail.paper.samples import Runs
+    from ssmail.plots.run_groups import Reads
     from ssmail.store import Store
 
 

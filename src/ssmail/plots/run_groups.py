@@ -1,14 +1,15 @@
-"""Groups of stored runs, as figures draw them, and how runs are sorted into them."""
+"""Groups of stored runs, as figures draw them, how runs are sorted into them, and what is read of a run."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from ssmail.config.experiments import to_tuples
 from ssmail.config.spec import flatten
 from ssmail.errors import InputError
 from ssmail.store import RunRow
+from ssmail.store.maintenance.compact import Thinning
 
 ABSENT = object()
 """The value of a key that a spec does not have."""
@@ -42,6 +43,27 @@ class Selection:
     def curves(self) -> dict[str, str]:
         """By run id, the label of the group that the run is drawn in."""
         return {run.id: group.label for group in self.groups for run in group.runs}
+
+
+@dataclass(frozen=True)
+class Reads:
+    """What a figure and its claim read from a run, besides the last values of metrics.
+
+    curves: metrics that are read over the epochs. arrays: names of arrays, each with the Thinning that reduces it to
+    what the figure shows, or None when all of it is read; the figure shows the same from the thinned array. landscapes:
+    whether the first and the last stored landscape are read.
+    """
+
+    curves: tuple[str, ...] = ()
+    arrays: Mapping[str, Thinning | None] = field(default_factory=dict)
+    landscapes: bool = False
+
+    def stored(self, names: Sequence[str]) -> dict[str, Thinning | None]:
+        """Return those of a run's arrays (`names`, sorted) that are read."""
+        from ssmail.plots.landscape_grids import first_and_last  # imported here because it needs matplotlib
+
+        read = {name: thin for name, thin in self.arrays.items() if name in names}
+        return read | dict.fromkeys(first_and_last(names)) if self.landscapes else read
 
 
 def check_settled(runs: Iterable[RunRow], lacking: str) -> None:
