@@ -102,12 +102,12 @@ def test_a_bad_override_is_one_sentence(environment: str, override: str, sentenc
 def test_a_field_or_section_that_is_added_as_null_leaves_the_hash_as_it_was(environment: str) -> None:
     """So that runs that are stored go on being those of the spec; once it has a value the hash is another."""
 
-    class Adversarial(specs.AdversarialSpec):
+    class Adversarial(specs.sections.AdversarialSpec):
         later: int | None
 
     class Later(RunSpec):
         adversarial: Adversarial | None
-        football: specs.ForecastSpec | None
+        football: specs.sections.ForecastSpec | None
 
     now = build_spec("gail", environment, "smoke")
     values = now.model_dump()

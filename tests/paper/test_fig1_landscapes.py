@@ -123,5 +123,5 @@ def test_nothing_stored_names_the_command(store: Store) -> None:
 
 def test_a_run_from_before_landscapes_is_refused_with_the_remedy(store: Store, add_run: AddRun) -> None:
     add_run(spec=build_spec("ssail", figure_requirements("fig1").environment, "smoke"))
-    with pytest.raises(InputError, match=r"stored no landscape: it is older .* --resume never"):
+    with pytest.raises(InputError, match=r"stored no landscape: an older ssmail .* --resume never"):
         collect(store)

@@ -14,8 +14,8 @@ from PIL import Image, ImageChops
 
 from ssmail.config.sections import YJunctionSpec
 from ssmail.data import expert_sets, yjunction
-from ssmail.data.mocap.dataset import MocapParameters, bundle
-from ssmail.data.trajectories import Trajectories
+from ssmail.data.mocap.dataset import NO_LINES, MocapParameters
+from ssmail.data.trajectories import ExpertSet, Trajectories
 from ssmail.errors import InputError
 from ssmail.plots import provenance, skeleton, style
 from ssmail.plots.saving import save_figure
@@ -46,7 +46,7 @@ def data(tmp_path: Path) -> Path:
         splits[split] = Trajectories.single_mode(positions, velocities, np.array([number, number]), frames)
     params = MocapParameters(subject=7, train=(1,), validation=(2,), test=(3,), window=5, test_window=9)
     path = tmp_path / "mocap.npz"
-    expert_sets.save(bundle(splits, params, JOINTS, PARENTS, {}), path)
+    expert_sets.save(ExpertSet.bundle(splits, NO_LINES, params.model_dump(mode="json"), JOINTS, PARENTS, {}), path)
     return path
 
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ssmail.data import expert_sets
-from ssmail.data.mocap.dataset import MocapParameters, bundle
-from ssmail.data.trajectories import SPLITS, Trajectories
+from ssmail.data.mocap.dataset import NO_LINES, MocapParameters
+from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError
 from ssmail.training.baselines import Baseline, CopyLast
 from ssmail.training.evaluators import ForecastEvaluator
@@ -38,7 +38,9 @@ def falling(tmp_path: Path) -> str:
         count = np.zeros(3, dtype=np.int64)
         splits[split] = Trajectories.single_mode(positions, velocities, count, count)
     params = MocapParameters(subject=35, train=(1,), validation=(2,), test=(3,), window=6, test_window=8)
-    expert_sets.save(bundle(splits, params, ("root", "hand"), (-1, 0), {}), tmp_path / "falling.npz")
+    values = params.model_dump(mode="json")
+    falling = ExpertSet.bundle(splits, NO_LINES, values, ("root", "hand"), (-1, 0), {})
+    expert_sets.save(falling, tmp_path / "falling.npz")
     return f"data.path={tmp_path / 'falling.npz'}"
 
 
