@@ -40,6 +40,15 @@ def _known_formats(formats: list[str]) -> list[str]:
     return formats
 
 
+def _known_statistic(stat: str | None) -> str | None:
+    """Return the name as given. Raises InputError for an unknown statistic."""
+    from ssmail.evaluation.statistics import Statistic
+
+    if stat is not None and stat not in list(Statistic):
+        raise unknown_name("statistic", stat, list(Statistic))
+    return stat
+
+
 Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
@@ -95,12 +104,16 @@ Formats = Annotated[
     list[str],
     typer.Option("--format", callback=_known_formats, help="png, pdf or svg; repeatable.", show_default="png"),
 ]
-Stat = Annotated[str | None, typer.Option("--stat", help=f"Centre and band: {STATISTICS}.", show_default="mean-std")]
+Stat = Annotated[
+    str | None,
+    typer.Option("--stat", callback=_known_statistic, help=f"Centre and band: {STATISTICS}.", show_default="mean-std"),
+]
 _WITH_STATISTIC = list(dict.fromkeys(figure.name for figure in FIGURES.values() if figure.has_statistic))
 StatOfFigures = Annotated[
     str | None,
     typer.Option(
         "--stat",
+        callback=_known_statistic,
         help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
         show_default="mean-std",
     ),
@@ -181,9 +194,7 @@ def pick_device(choice: Device) -> str:
 
 
 def parse_statistic(stat: str | None) -> "Statistic | None":
-    """Return the statistic of that name. Raises InputError for an unknown one."""
+    """Return the statistic of that name, which --stat has checked."""
     from ssmail.evaluation.statistics import Statistic
 
-    if stat is not None and stat not in list(Statistic):
-        raise unknown_name("statistic", stat, list(Statistic))
     return None if stat is None else Statistic(stat)

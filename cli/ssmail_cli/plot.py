@@ -154,12 +154,22 @@ OneRun = Annotated[
 
 
 class FigureCommand(TyperCommand):
-    """The command of a figure of the paper, without the options that the figure does not have."""
+    """The command of a figure of the paper, without the options that the figure does not have.
+
+    What does not go together is refused while the options are parsed, before anything is drawn.
+    """
 
     def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
         module = FIGURES[name]
         lacks = {"environment": not module.has_environment, "stat": not module.has_statistic}
         super().__init__(name, params=[item for item in params if not lacks.get(item.name)], **settings)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the options. Raises InputError for two choices of runs."""
+        rest = super().parse_args(ctx, args)
+        if ctx.params["runs"] and ctx.params["profile"]:
+            raise InputError("--runs names the runs already; leave --profile out.")
+        return rest
 
 
 def figure(
@@ -174,8 +184,6 @@ def figure(
     """Draw the figure that the command is called like."""
     from ssmail.config.experiments import figure_requirements
 
-    if runs and profile:
-        raise InputError("--runs names the runs already; leave --profile out.")
     module, to = FIGURES[str(ctx.info_name)], ctx.obj
     statistic, store = parse_statistic(stat), open_store(to.db)
     record = module.collect(store, runs, profile=profile, statistic=statistic, environment=environment)

@@ -210,8 +210,20 @@ def test_a_value_may_be_called_like_a_figure(
     assert {path.stem for path in (tmp_path / "fig5").iterdir()} == {"fig9_yjunction"}
 
 
-def test_nothing_is_drawn_before_all_options_are_parsed(cli: CommandLine, db: Path, tmp_path: Path) -> None:
-    outcome = cli("plot", "training", "fig9", "--metric", "train/mode_mse", "--out", tmp_path / "figures", "--db", db)
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        "training fig9 --metric train/mode_mse",
+        "training fig9 --runs RUN --profile smoke",
+        "fig9 fig4 --stat mean",
+        "fig9 --format bmp",
+    ],
+)
+def test_nothing_is_drawn_before_all_options_are_checked(
+    cli: CommandLine, db: Path, tmp_path: Path, arguments: str
+) -> None:
+    words = arguments.replace("RUN", Store.open(db).runs()[0].id).split()
+    outcome = cli("plot", *words, "--out", tmp_path / "figures", "--db", db)
     assert (outcome.code, (tmp_path / "figures").exists()) == (2, False)
 
 
