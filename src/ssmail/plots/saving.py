@@ -14,7 +14,10 @@ from ssmail.plots.provenance import FORMATS, Provenance
 
 
 def save_figure(stem: str, record: FigureRecord, figure: Figure, outdir: Path, formats: Sequence[str]) -> list[Path]:
-    """Write outdir/stem.FORMAT for each format, then outdir/stem.csv, making missing folders; see figures.save."""
+    """Write outdir/stem.FORMAT for each format, then outdir/stem.csv, and return their paths, the CSV last.
+
+    Creates the folder. Raises InputError for an unknown format or a folder that cannot be written.
+    """
     for format in formats:
         if format not in FORMATS:
             raise InputError(f"unknown figure format '{format}'; choose from {', '.join(FORMATS)}.")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES, save
-from ssmail.plots import provenance
 from ssmail.plots.provenance import Provenance
 from ssmail.store import Store
 
@@ -73,4 +72,4 @@ def draw(
     record = module.collect(store, runs, profile=profile, statistic=statistic)
     figure = module.draw(record)
     files = save(name, record, figure, out, formats)
-    return Drawn(module.name, tuple(files), figure, provenance.read(files[0]), record.notes)
+    return Drawn(module.name, tuple(files), figure, record.provenance, record.notes)
