@@ -213,7 +213,10 @@ def _settled_runs(
     store: "Store", figures: Mapping[str, Sweep], data: _Data, sweep: Sweep, rows: Rows
 ) -> "dict[Cell, str]":
     """Return the run id of each cell that finished or diverged, stored runs of missing data included."""
-    ended = {cell: row["id"] for cell, row in zip(sweep, rows, strict=True) if row["state"] in ("finished", "diverged")}
+    from ssmail.store import RunState
+
+    states = [row["state"] and RunState(row["state"]) for row in rows]  # None without a run
+    ended = {cell: row["id"] for cell, row, state in zip(sweep, rows, states, strict=True) if state and state.settled}
     return ended | _stored_runs(store, _merged(figures[name] for name in data.missing))
 
 
