@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 DOCS_INSTALLED := .venv/.installed-docs
 
-.PHONY: help venv demo test test-slow check docs bench clean
+.PHONY: help venv demo test test-slow test-crash fuzz check docs bench clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -26,10 +26,16 @@ demo: $(INSTALLED)  ## train SS-AIL on the Y-Junction (a few minutes) and draw i
 	@echo "Now look at results/figures/fig5_modes.png (trajectories over the lanes) and fig4_stability.png (error over epochs)."
 
 test: $(INSTALLED)  ## the tests, without the slow ones
-	$(BIN)/pytest -n 2 -m "not slow"
+	$(BIN)/pytest -n 2 -m "not slow and not crash"
 
 test-slow: $(INSTALLED)  ## the slow tests (minutes)
 	$(BIN)/pytest -m slow
+
+test-crash: $(INSTALLED)  ## 100 SIGKILLs at random moments; each restart must end as an undisturbed run (an hour at most)
+	$(BIN)/pytest -m crash
+
+fuzz: $(INSTALLED)  ## 20,000 hostile files and arguments (half an hour at most)
+	SSMAIL_FUZZ=1 timeout 30m $(BIN)/pytest -n 2 tests/hostile
 
 check: $(INSTALLED)  ## lint, format and types
 	$(BIN)/ruff check

@@ -1,0 +1,31 @@
+"""The number of cases that were tried, at the end of the run; no settings of the developer."""
+
+import pytest
+
+from tests.hostile import harness
+
+SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
+_cases = pytest.StashKey[int]()
+
+
+@pytest.fixture(autouse=True)
+def _no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    output = getattr(session.config, "workeroutput", None)  # of a worker of pytest-xdist
+    if output is not None:
+        output["hostile_cases"] = harness.counted
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: object) -> None:
+    stash = node.config.stash  # type: ignore[attr-defined]
+    stash[_cases] = stash.get(_cases, 0) + getattr(node, "workeroutput", {}).get("hostile_cases", 0)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    count = config.stash.get(_cases, 0) + harness.counted
+    terminalreporter.write_line(f"{count} hostile cases tried")
