@@ -1,7 +1,6 @@
 """The harness notices what it is there for."""
 
 import importlib
-import sys
 import time
 from pathlib import Path
 
