@@ -22,7 +22,7 @@ from PIL import Image
 from ssmail.data import expert_sets
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError, unknown_name
-from ssmail.plots import style
+from ssmail.plots import saving, style
 from ssmail.plots.provenance import Provenance
 
 NAME = "skeleton"
@@ -170,20 +170,9 @@ def draw(record: SkeletonRecord) -> Figure:
 def save_film(record: SkeletonRecord, path: Path) -> None:
     """Write an animated GIF of all the window's frames, with the provenance as its comment."""
     with style.sheet():
-        pictures = list(_film(record))
-    first, *rest = [picture.quantize(colors=64) for picture in pictures]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        first.save(
-            path,
-            save_all=True,
-            append_images=rest,
-            duration=round(1000 * STRIDE / (RATE * SPEED)),
-            loop=0,
-            comment=record.provenance.as_json(),
-        )
-    except OSError as error:
-        raise InputError(f"{path.parent} cannot be written: {error.strerror}; choose another folder.") from None
+        pictures = [picture.quantize(colors=64) for picture in _film(record)]
+    times = [round(1000 * STRIDE / (RATE * SPEED))] * len(pictures)
+    saving.save_film(pictures, path, times, record.provenance)
 
 
 def _film(record: SkeletonRecord) -> Iterator[Image.Image]:
