@@ -49,9 +49,7 @@ def test_a_list_of_a_million_members_is_not_read(tmp_path: Path, monkeypatch: py
         assert len(archive.infolist()) == 100
 
 
-@pytest.mark.parametrize(
-    ("method", "plain"), [("STORED", True), ("DEFLATED", True), ("BZIP2", False), ("LZMA", False)]
-)
+@pytest.mark.parametrize(("method", "plain"), [("STORED", True), ("DEFLATED", True), ("BZIP2", False), ("LZMA", False)])
 def test_only_stored_and_deflated_members_are_plain(method: str, plain: bool) -> None:
     member = zipfile.ZipInfo("name")
     member.compress_type = getattr(zipfile, f"ZIP_{method}")

@@ -143,12 +143,12 @@ def _load(file: "_File", environment: str | None) -> ExpertSet:
         raise file.fault(f"the parameters inside {file.path} cannot be read") from error
     if experts.hash != file.text("hash"):
         raise file.fault(f"{file.path} was changed after it was written (its hash does not match its arrays)")
+    if not experts.is_scalable:
+        raise file.fault(f"the numbers in {file.path} are too large or too small to be scaled to [-1, 1]")
     if found == "mocap" and not np.array_equal(
         file.array("scaling", (4,), np.float64), _mocap_arrays(experts)["scaling"]
     ):
         raise file.fault(f"the scaling in {file.path} is not that of its training split")
-    if not experts.is_scalable:
-        raise file.fault(f"the numbers in {file.path} are too large or too small to be scaled to [-1, 1]")
     return experts
 
 
@@ -237,8 +237,10 @@ class _File:
             raise self.fault(f"{key} in {self.path} holds {header.dtype} values")
         with self.archive.open(header.member) as file:
             file.read(header.begin)
-            data = read_whole(file, header.member.file_size - header.begin)
-        array = np.frombuffer(data or b"", header.dtype)
+            data = read_whole(file, header.member.file_size - header.begin) or bytearray()
+        if kind is np.str_:
+            data.decode("utf-32-le")  # raises UnicodeDecodeError for what is no text; numpy trusts it
+        array = np.frombuffer(data, header.dtype)
         array = array.reshape(shape[::-1]).T if header.fortran else array.reshape(shape)
         if kind is np.float64 and not np.isfinite(array).all():
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
