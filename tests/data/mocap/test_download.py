@@ -118,7 +118,8 @@ def test_a_wrong_digest_is_refused_and_not_kept(fetch: Fetch, site: Site, tmp_pa
     good = site.files["/subjects/35/35_01.amc"]
     site.files["/subjects/35/35_01.amc"] = MOTION.replace(b"17.9", b"18.0")
     with pytest.raises(
-        SsmailError, match=r"35_01\.amc is not the file that ssmail knows \(its SHA-256 differs\); .*sou"
+        SsmailError,
+        match=r"35_01\.amc is not the file that ssmail knows \(its SHA-256 differs\) and was deleted; .*sou",
     ):
         fetch()
     assert [path.name for path in (tmp_path / "cache/35").iterdir()] == ["35.asf"]
