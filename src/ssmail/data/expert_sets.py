@@ -27,7 +27,7 @@ from ssmail.data.foreign_files import ARCHIVE_ERRORS, is_plain, open_regular, re
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.mocap.acclaim_lines import is_name
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 
 COMMANDS = {
     "yjunction": "ssmail generate-yjunction",
@@ -115,7 +115,8 @@ def load(path: Path, environment: str | None = None) -> ExpertSet:
             with zipfile.ZipFile(contents) as archive:
                 return _load(_File(path, command, archive, os.fstat(contents.fileno()).st_size), environment)
     except FileNotFoundError:
-        raise InputError(f"there is no file {path}; make it with `{command} --out {path}`") from None
+        remedy = command_line(*command.split(), "--out", path)
+        raise InputError(f"there is no file {path}; make it with `{remedy}`") from None
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}; check its permissions") from None
     except MemoryError:
