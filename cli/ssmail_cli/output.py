@@ -180,11 +180,18 @@ def _json_value(value: Any) -> Any:
 
 @contextmanager
 def _opened(out: Path | None) -> Iterator[TextIO]:
-    """Open a file that is written whole or not at all, or stdout (None). Raises InputError when it cannot be written."""
+    """Open a file, which is written whole or not at all, a device, or stdout (None).
+
+    Raises InputError when it cannot be written.
+    """
     if out is None:
         yield sys.stdout
         return
     try:
+        if out.exists() and not out.is_file():  # such as /dev/stdout or a pipe; a folder raises
+            with out.open("w", encoding="utf-8", newline="") as file:
+                yield file
+            return
         with atomic_write(out) as partial, partial.open("w", encoding="utf-8", newline="") as file:
             yield file
     except OSError as error:
