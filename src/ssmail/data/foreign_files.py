@@ -46,14 +46,15 @@ class _BoundedFile(io.BufferedReader):
 
 
 @contextmanager
-def open_regular(path: Path) -> Iterator[io.BufferedReader]:
-    """Open a file for reading; links are followed. Never waits for a pipe or device.
+def open_regular(path: Path, *, follow: bool = True) -> Iterator[io.BufferedReader]:
+    """Open a file for reading; a link is followed unless `follow` is off. Never waits for a pipe or device.
 
     Raises OSError if it cannot be opened, IrregularFileError if it is not a regular file. An unusable name, with a zero
     byte in it, counts as absent.
     """
+    extra = getattr(os, "O_NONBLOCK", 0) | (0 if follow else getattr(os, "O_NOFOLLOW", 0))
     try:
-        raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0)))
+        raw = io.FileIO(path, opener=lambda name, flags: os.open(name, flags | extra))
     except IsADirectoryError:
         raise IrregularFileError from None
     except ValueError:

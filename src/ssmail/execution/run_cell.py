@@ -4,7 +4,6 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,6 +15,7 @@ from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.planning import BEST, LAST, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
+from ssmail.store.checkpoint_files import run_folder
 from ssmail.training.loop import Divergence, TrainingLoop, load_checkpoint, save_checkpoint
 
 
@@ -77,7 +77,7 @@ def run_cell(
     on_event(Event("resumed" if plan.row else "started", cell, writer.run_id, loop.epoch, epochs))
     with _heartbeats(writer, settings.heartbeat_seconds):
         try:
-            return _train(cell, loop, writer, store.checkpoint_root / writer.run_id, on_event, should_stop)
+            return _train(cell, loop, writer, on_event, should_stop)
         except Exception as error:
             with suppress(SsmailError):  # if writing to the store fails too, report the first error
                 writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{traceback.format_exc()}")
@@ -95,7 +95,7 @@ def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
-    last = store.checkpoint_root / plan.row.id / LAST
+    last = run_folder(store.checkpoint_root, plan.row.id) / LAST
     if last.exists():
         loop.load_state_dict(load_checkpoint(last))
     return store.resume_run(plan.row.id, loop.epoch)
@@ -105,7 +105,6 @@ def _train(
     cell: Cell,
     loop: Loop,
     writer: RunWriter,
-    folder: Path,
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Event:
@@ -121,28 +120,28 @@ def _train(
         try:
             metrics = loop.run_epoch()
         except Divergence as error:
-            _record_checkpoints(writer, folder)
+            _record_checkpoints(writer)
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
         if loop.snapshot:
             writer.arrays(loop.snapshot)
         if loop.improved:
-            save_checkpoint(folder / BEST, loop.best_state_dict())
-        save_checkpoint(folder / LAST, loop.state_dict())
+            save_checkpoint(writer.folder / BEST, loop.best_state_dict())
+        save_checkpoint(writer.folder / LAST, loop.state_dict())
         on_event(Event("epoch", cell, writer.run_id, loop.epoch, epochs, metrics))
     metrics, arrays = loop.final_evaluation()
     writer.final(loop.epoch, metrics)
     writer.arrays(arrays)
-    _record_checkpoints(writer, folder)
+    _record_checkpoints(writer)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
 
 
-def _record_checkpoints(writer: RunWriter, folder: Path) -> None:
+def _record_checkpoints(writer: RunWriter) -> None:
     for name in (BEST, LAST):
-        if (folder / name).exists():
-            writer.artifact(name, folder / name)
+        if (writer.folder / name).exists():
+            writer.artifact(name)
 
 
 @contextmanager

@@ -209,8 +209,11 @@ def test_a_truncated_file_is_told(filled: Path) -> None:
 def test_an_empty_file_has_no_tables_yet(tmp_path: Path) -> None:
     (tmp_path / "empty.db").touch()
     (problem,) = check(tmp_path / "empty.db")
-    assert (problem.check, problem.problem) == ("schema", "it has no tables yet")
-    assert "ssmail db upgrade" in problem.remedy
+    assert problem.check == "schema"
+    assert problem.problem.startswith("it has no tables yet")
+    assert "the next command that opens it makes them" in problem.remedy
+    Store.open(tmp_path / "empty.db").close()
+    assert check(tmp_path / "empty.db") == []
 
 
 def test_what_is_no_database_of_ssmails_is_refused(tmp_path: Path) -> None:

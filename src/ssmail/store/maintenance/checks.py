@@ -54,10 +54,14 @@ def _problems(path: Path, connection: Connection, revision: str | None, folders:
         yield from (_damage(path, str(line)) for line in damage)
         return
     if revision != REVISIONS[-1]:
-        old = f"its schema is {revision}, but {REVISIONS[-1]} is current"
-        found = "it has no tables yet" if revision is None else old
         command = command_line("ssmail", "db", "upgrade", "--db", path)
-        yield Problem("schema", path.name, found, f"run `{command}`, then check again")
+        if revision is None:
+            found = "it has no tables yet; the process that created it was stopped before it made them"
+            remedy = f"use it as it is, for the next command that opens it makes them, such as `{command}`"
+        else:
+            found = f"its schema is {revision}, but {REVISIONS[-1]} is current"
+            remedy = f"run `{command}`, then check again"
+        yield Problem("schema", path.name, found, remedy)
         return
     yield from _orphans(path, connection)
     runs = queries.runs(connection)
@@ -141,7 +145,7 @@ def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> 
     for run in runs:
         for row in queries.artifacts(connection, run.id, checkpoint_root_of(path)):
             if wrong := fault_of(row):
-                remedy = f"copy it from a backup to {row.path}, or {_again(run)}"
+                remedy = f"copy it from a backup to {row.path}, or {_again(run)}" if row.path else _again(run)
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 
@@ -171,8 +175,10 @@ def _run_ids(path: Path) -> set[str]:
     """Return the ids of the runs in the file; empty if it is not an ssmail database."""
     try:
         with opened(path) as engine, engine.connect() as connection:
+            if revision_of(connection, engine) is None:
+                return set()
             return set(connection.execute(select(schema.run.c.id)).scalars())
-    except DBAPIError:
+    except (DBAPIError, InputError):
         return set()
 
 
