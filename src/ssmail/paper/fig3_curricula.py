@@ -10,7 +10,6 @@ lengths, because the closed form is the same for all seeds. Gradual is judged ag
 paper calls less smooth (in a passage that is commented out).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
 
@@ -29,8 +28,7 @@ from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band, check_recorded
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads
-from ssmail.plots.series import select
+from ssmail.plots.run_groups import Group, Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig3"
@@ -71,18 +69,8 @@ class CurriculaRecord:
         return pd.DataFrame(rows, columns=list(curves.COLUMNS))
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> CurriculaRecord:
-    """Collect the segment lengths of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run that stored no segment lengths.
-    """
-    selection = select(store, NAME, runs, profile)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> CurriculaRecord:
+    """Collect the segment lengths of the runs. Raises InputError for a run that stored no segment lengths."""
     values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
     measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
     check_recorded(selection.groups, MEASURED, measured)

@@ -31,8 +31,7 @@ from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Reads
-from ssmail.plots.series import select
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig4"
@@ -78,18 +77,8 @@ class StabilityRecord:
         return pd.DataFrame(rows, columns=list(curves.COLUMNS))
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> StabilityRecord:
-    """Collect the training errors of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without training errors.
-    """
-    selection = select(store, NAME, runs, profile)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> StabilityRecord:
+    """Collect the training errors of the runs. Raises InputError for a run without training errors."""
     errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
     check_recorded(selection.groups, METRIC, errors)
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)

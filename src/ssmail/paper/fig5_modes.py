@@ -31,7 +31,6 @@ from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection, check_settled
-from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
@@ -104,12 +103,8 @@ class ModesRecord:
         return int((~inside).any(axis=(1, 2)).sum())
 
 
-def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
-    """Collect the test rollouts of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
-    """
-    selection = select(store, NAME, runs, profile)
+def collect(store: Store, selection: Selection) -> ModesRecord:
+    """Collect the test rollouts of the runs. Raises InputError for a run without test rollouts."""
     check_settled(selection.runs, "test rollouts")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = shown_lanes(store.array(finished[0].id, LANES)) if finished else np.empty((0, 0, 0, 0, 2))

@@ -32,8 +32,8 @@ from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
 from ssmail.plots.curves import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads, check_settled
-from ssmail.plots.series import figure_ablation, select
+from ssmail.plots.run_groups import Group, Reads, Selection, check_settled
+from ssmail.plots.series import figure_ablation
 from ssmail.store import Store
 
 NAME = "fig6"
@@ -103,19 +103,9 @@ class BetaRecord:
         return pd.DataFrame(rows, columns=["kind", "beta", "run_id", "seed", *measured])
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> BetaRecord:
-    """Collect the test results of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
-    """
+def collect(store: Store, selection: Selection, statistic: Statistic) -> BetaRecord:
+    """Collect the test results of the runs. Raises InputError for a run without test results."""
     figure_ablation(NAME)  # without one there are no values for the axis
-    selection = select(store, NAME, runs, profile)
     check_settled(selection.runs, "test error")
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(

@@ -40,7 +40,6 @@ from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
-from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig8"
@@ -86,20 +85,8 @@ class AlphaRecord:
         return pd.DataFrame(rows, columns=["metric", *curves.COLUMNS])
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-    environment: str | None = None,
-) -> AlphaRecord:
-    """Collect the runs that the figure draws by default, or those of the given ids.
-
-    `environment` is that of the ablation by default.
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
-    """
-    selection = select(store, NAME, runs, profile, environment)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> AlphaRecord:
+    """Collect the policy's errors and D's losses of the runs. Raises InputError for a run without these metrics."""
     kind = ERRORS[selection.runs[0].environment]
     error = f"train/{kind}"
     errors = _bands(store, selection, error, [error], statistic)
