@@ -26,7 +26,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
-from ssmail.plots.curves import Band, Curve, band, check_recorded
+from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, Reads, Selection
 from ssmail.store import Store
@@ -71,11 +71,9 @@ class CurriculaRecord:
 
 def collect(store: Store, selection: Selection, statistic: Statistic) -> CurriculaRecord:
     """Collect the segment lengths of the runs. Raises InputError for a run that stored no segment lengths."""
-    values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
-    measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
-    check_recorded(selection.groups, MEASURED, measured)
+    expected = store.metrics([run.id for run in selection.runs], names=[EXPECTED])
     return CurriculaRecord(
-        bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
+        bands=curves.bands(store, selection, [MEASURED], statistic),
         expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
         statistic=statistic,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),

@@ -29,7 +29,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
+from ssmail.plots.curves import REFERENCE, Band, constant_velocity
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
@@ -79,9 +79,7 @@ class StabilityRecord:
 
 def collect(store: Store, selection: Selection, statistic: Statistic) -> StabilityRecord:
     """Collect the training errors of the runs. Raises InputError for a run without training errors."""
-    errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
-    check_recorded(selection.groups, METRIC, errors)
-    bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
+    bands = curves.bands(store, selection, [METRIC], statistic)
     return StabilityRecord(
         bands=bands,
         statistic=statistic,
