@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import matplotlib.font_manager  # noqa: F401 (keeps a list of fonts outside of the cases' folders)
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
