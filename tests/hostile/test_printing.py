@@ -45,7 +45,7 @@ COMMANDS = (
     ("db", "check"),
     ("db", "check", "--json"),
     ("report", "--out", "figures", "--format", "svg"),
-    ("plot", "--out", "figures", "--format", "svg", "training"),
+    ("plot", "--out", "figures", "--format", "svg", "training", "--metric", "validation/mode_mse"),
     ("plot", "--out", "figures", "--format", "svg", "fig4"),
     ("db", "export", "--compact", "small.db"),
 )
@@ -116,6 +116,24 @@ def test_a_stored_text_is_only_printed(
     spoil(database, place, text)
     with contextlib.chdir(folder):
         hold(folder, *command, "--db", database)
+
+
+@pytest.mark.parametrize("form", ["table", "csv", "json"])
+def test_a_figure_of_a_hostile_database_is_explained_as_text(
+    original: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    database = tmp_path / "ssmail.db"
+    database.write_bytes(original)
+    for place in ("method", "profile", "package_version"):
+        spoil(database, place, f"\x1b[2J\u202e\n{place}")
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = hold(
+        tmp_path, "plot", "--out", "figures", "training", "--metric", "validation/mode_mse", "--db", database
+    )
+    assert code == 0
+    code, out, _ = hold(tmp_path, "explain", out.split()[0], "--format", form, "--db", database)
+    assert code == 0
+    assert r"\x1b[2J" in out or r"\u001b[2J" in out
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
