@@ -15,7 +15,7 @@ from ssmail.plots.formatting import duration
 from ssmail_cli import options
 from ssmail_cli.datasets import prep_mocap
 from ssmail_cli.options import Device, is_missing, parse_seeds
-from ssmail_cli.output import chosen_format, error_line, note, print_rows
+from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
 from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows, unfinished
@@ -93,6 +93,8 @@ def reproduce(
     if only is None:
         try:
             write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
+        except (BrokenPipeError, OutputError):
+            raise
         except Exception as error:  # the figures are drawn already
             note(f"the report is not written: {error_line(error)}")
             failed = True

@@ -13,12 +13,13 @@ LONGEST = 300
 """Characters of a message."""
 _NAME = 60  # characters of a name in a message
 _CHOICES = 160  # characters of a list of names
-_WORD = 120  # characters of a word in a suggested command
+_WORD = 200  # characters of a word in a suggested command
 # Characters that Python counts as printable and that take no room, or look like a space.
 _INVISIBLE = re.compile(
     "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
 )
-_CREDENTIALS = re.compile(r"(://[^\s:/?#@]*):.*@")
+_CREDENTIALS = re.compile(r"(://[^\s:/?#@]*):.*(@|%40)")
+_LONG_COMMAND = re.compile(r"`[^`]{60,}`")
 _QUERY = re.compile(r"(?<=://)([^\s?]*\?)(\S*)")
 
 
@@ -79,8 +80,12 @@ def shortened(text: str, length: int) -> str:
 
 
 def sentence(text: str) -> str:
-    """Return the text as a message of one line: printable, without passwords, and of at most LONGEST characters."""
-    return shortened(printable(" ".join(masked(text).split())), LONGEST)
+    """Return the text as a message of one line: printable, without passwords, and of at most LONGEST characters.
+
+    A long command is left out of a text that is too long: without its middle it could be another command.
+    """
+    line = printable(" ".join(masked(text).split()))
+    return shortened(line if len(line) <= LONGEST else _LONG_COMMAND.sub("`...`", line), LONGEST)
 
 
 def command_line(*words: object) -> str:

@@ -147,7 +147,10 @@ def hold(folder: Path, *arguments: object) -> tuple[int, str, str]:
 
 
 def held(code: int, out: str, err: str) -> None:
-    """Assert that a command ended as one may: with a code of its own, and printable text of bearable length."""
+    """Assert that a command ended as one may: with a code of its own, and printable text of bearable length.
+
+    With exit code 1 and a result on stdout, the result is the reason (`ssmail db check`, `ssmail explain`).
+    """
     assert code in (0, 1, 2, 3), code
     assert "Traceback" not in err, err
     assert "unexpected " not in err, err

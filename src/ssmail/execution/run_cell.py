@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.planning import BEST, LAST, Plan, plan_cell
@@ -80,7 +80,7 @@ def run_cell(
             return _train(cell, loop, writer, on_event, should_stop)
         except Exception as error:
             with suppress(SsmailError):  # if writing to the store fails too, report the first error
-                writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{traceback.format_exc()}")
+                writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(traceback.format_exc())}")
             return Event("failed", cell, writer.run_id, loop.epoch, epochs, message=_summary(error))
 
 
@@ -164,4 +164,4 @@ def _heartbeats(writer: RunWriter, seconds: float) -> Iterator[None]:
 
 
 def _summary(error: Exception) -> str:
-    return str(error) if isinstance(error, SsmailError) else f"{type(error).__name__}: {error}"
+    return masked(str(error) if isinstance(error, SsmailError) else f"{type(error).__name__}: {error}")

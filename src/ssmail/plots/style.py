@@ -3,6 +3,7 @@
 Colours are those of Okabe and Ito (2008); methods differ by line style too, so that a grey print stays readable.
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -91,8 +92,12 @@ def strokes(labels: Sequence[str]) -> dict[str, Stroke]:
 
 @contextmanager
 def sheet() -> Iterator[None]:
-    """Draw and save within the style sheet, on top of matplotlib's own defaults and not of the user's settings."""
-    with matplotlib.rc_context():
+    """Draw and save within the style sheet, on top of matplotlib's own defaults and not of the user's settings.
+
+    Letters that the font lacks are drawn as boxes, without a warning for each.
+    """
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(SHEET)
         yield

@@ -92,7 +92,9 @@ def as_url(where: str | Path) -> URL:
     if url.get_backend_name() != "sqlite":
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
-        raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
+        raise InputError(
+            f"{shortened(masked(where), 100)} is not a file on disk, which ssmail needs; give the path of a file"
+        )
     return _file_url(Path(str(url.database)))
 
 

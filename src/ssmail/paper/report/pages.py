@@ -26,7 +26,7 @@ TEMPLATES = Path(__file__).with_name("templates")
 INLINE = (".png", ".svg")  # formats that Markdown viewers display
 SPECIAL = re.compile(r"[\\`*\[\]<>|~$]|&(?=[#\w])|(?<![^\W_])_|_(?![^\W_])")
 """What means something to Markdown in the middle of a line; a backslash before it takes that away."""
-BLOCK = re.compile(r"^(\s*\d*)([-+=.)])(?=[\s=-])|^(\s*)(#)")
+BLOCK = re.compile(r"^(\s*\d*)([-+=.)])(?=[\s=-]|$)|^(\s*)(#)")
 """What begins a list, a rule or a heading where it begins a line; a minus before a number is none."""
 SIGNS = {Verdict.SUPPORTED: "✓", Verdict.CONTRADICTED: "✗", Verdict.INCONCLUSIVE: "?"}
 
