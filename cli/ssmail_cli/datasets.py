@@ -86,7 +86,7 @@ def prep_mocap(
         typer.Option("--source", help="Folder or zip file that contains 35.asf and 35_01.amc ... at any depth."),
     ] = None,
     download: Annotated[
-        bool, typer.Option("--download", help="Fetch the files from the (slow) CMU site into --cache instead.")
+        bool, typer.Option("--download", help="Fetch the files from the CMU site (slow, plain HTTP) into --cache.")
     ] = False,
     cache: Annotated[
         Path | None,

@@ -41,6 +41,8 @@ HEAD = "head"
 MARGIN = 1.2  # around the skeleton, in file units, of which a person has about 30
 TICK = 10.0
 HIGHEST = 5.0  # inches of a film
+TALLEST = 20.0  # inches of a picture
+FARTHEST = 2000.0  # file units that a picture may span, with a tick every TICK
 STILL = 1e-6  # file units; a root that moves less has no walking direction
 
 
@@ -84,7 +86,7 @@ class SkeletonRecord:
 def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
     """Collect one window of the set that `ssmail prep-mocap` wrote to `path`.
 
-    Raises InputError when there is no such set, split or window.
+    Raises InputError when there is no such set, split or window, and when the window spans more than FARTHEST.
     """
     if split not in SPLITS:
         raise unknown_name("split", split, SPLITS)
@@ -96,6 +98,9 @@ def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
     assert windows.frame is not None
     trial = f"{experts.parameters['subject']:02d}_{windows.trial[window]:02d}"
     positions, first = windows.positions[window], int(windows.frame[window])
+    span = float(np.ptp(positions, axis=(0, 1)).max())
+    if span > FARTHEST:
+        raise InputError(f"{split} window {window} of {path} spans {span:.3g} units, too far to draw; choose another.")
     return SkeletonRecord(
         places=seen_from_the_side(positions),
         joints=experts.joints,
@@ -144,13 +149,19 @@ def seen_from_the_side(positions: Floats) -> Floats:
 
 
 def draw(record: SkeletonRecord) -> Figure:
-    """Draw one panel for each pose, all at one scale and as wide as the widest pose."""
+    """Draw one panel for each pose, all at one scale and as wide as the widest pose.
+
+    Raises InputError when the picture would be taller than TALLEST.
+    """
     poses = record.places[record.shown]
     half = max(float(np.ptp(pose[:, 0])) for pose in poses) / 2 + MARGIN
     heights = _heights(record)
     with style.sheet():
         scale = (style.COLUMN_WIDTH - 0.5) / len(poses) / (2 * half)  # inches per unit
-        figure = style.new_figure(height=scale * (heights[1] - heights[0]) + 0.87)
+        height = scale * (heights[1] - heights[0]) + 0.87
+        if height > TALLEST:
+            raise InputError(f"{record.split} window {record.window} is too tall for its width; choose another.")
+        figure = style.new_figure(height=height)
         figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.03, wspace=0, hspace=0)
         panels = figure.subplots(1, len(poses), sharey=True, squeeze=False)[0]
         for axes, step, pose in zip(panels, record.shown, poses, strict=True):

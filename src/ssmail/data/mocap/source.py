@@ -51,7 +51,7 @@ class _Archive:
     archive: zipfile.ZipFile
 
     def names(self) -> Iterator[str]:
-        return (member.filename for member in self.archive.infolist() if not member.is_dir())
+        return (name for name in self.archive.namelist() if not name.endswith("/"))
 
     def read(self, name: str) -> bytes:
         label = shown(f"{shown(name)} in {self.path}")
