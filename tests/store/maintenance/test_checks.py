@@ -1,6 +1,7 @@
 """A sound database has no problem; every kind of damage is found, alone, with its remedy."""
 
 import re
+import shlex
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -163,7 +164,8 @@ def test_the_remedies_for_orphans_and_stale_runs_help(filled: Path) -> None:
         f"1 row belongs to no run in the table {table}" for table in ("metric", "metric_latest")
     ]
     for problem in orphans:
-        change(filled, problem.remedy.split('"')[1])
+        _, _, statement = shlex.split(problem.remedy.split("`")[1])
+        change(filled, statement)
     opened = Store.open(filled)
     opened.mark_stale()
     opened.close()
