@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssmail.config import strict_yaml
-from ssmail.errors import InputError, suggestion, unknown_name
+from ssmail.errors import InputError, shortened, suggestion, unknown_name
 
 LAYERS = (
     "defaults",
@@ -103,7 +103,7 @@ def _parsed(path: Path, source: bytes) -> Experiments:
         raise InputError(f"{path} contains no mapping; it needs the sections {', '.join(sections)}.")
     for name in content:
         if name not in sections:
-            raise InputError(f"unknown section '{name}' in {path}; {suggestion(str(name), sections)}")
+            raise InputError(f"unknown section '{shortened(name, 60)}' in {path}; {suggestion(name, sections)}")
     for name in sections:
         if not isinstance(content.get(name), dict):
             raise InputError(f"section '{name}' of {path} is missing or no mapping; compare with the shipped one.")
