@@ -1,5 +1,6 @@
 """The number of cases that were tried, at the end of the run; no settings of the developer."""
 
+import matplotlib.font_manager  # noqa: F401 (the first import makes folders in the user's home)
 import pytest
 
 from tests.hostile import harness
