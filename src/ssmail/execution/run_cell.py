@@ -1,5 +1,6 @@
 """Computes one cell in this process: trains, stores metrics and checkpoints, and resumes an unfinished run."""
 
+import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -14,9 +15,10 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
-from ssmail.execution.planning import BEST, LAST, Plan, plan_cell
+from ssmail.execution.planning import BEST, LAST, LASTS, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.training.loop import Divergence, TrainingLoop, load_checkpoint, save_checkpoint
+from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
+from ssmail.training.loop import Divergence, TrainingLoop
 
 
 class Loop(Protocol):
@@ -95,10 +97,23 @@ def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
-    last = store.checkpoint_root / plan.row.id / LAST
-    if last.exists():
-        loop.load_state_dict(load_checkpoint(last))
+    _load_last(store, plan.row.id, loop)
     return store.resume_run(plan.row.id, loop.epoch)
+
+
+def _load_last(store: Store, run_id: str, loop: Loop) -> None:
+    """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
+    folder = store.checkpoint_root / run_id
+    recorded = [row for row in store.artifacts(run_id) if row.name == LAST]
+    sha256 = recorded[0].sha256 if recorded else None  # runs of older versions record it at their end only
+    name = recorded[0].path.name if recorded else LAST
+    last = folder / (name if name in LASTS else LAST)
+    if not os.path.lexists(last):
+        return
+    try:
+        loop.load_state_dict(load_checkpoint(last, sha256))
+    except UnfitState as error:
+        raise InputError(f"the checkpoint {last} does not fit its run ({error}); {AFRESH}") from error
 
 
 def _train(
@@ -109,8 +124,9 @@ def _train(
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Event:
-    # Each epoch is written in this order: metrics, arrays, checkpoint. So a checkpoint is never ahead of the database,
-    # and what a killed process stored after its last checkpoint is computed again, to the same bits.
+    # Each epoch is written in this order: metrics, arrays, checkpoint, and the checkpoint's record. So a recorded
+    # checkpoint is never ahead of the database, and what a killed process stored after it is computed again, to the
+    # same bits. Two files take turns: the recorded one stays until the next one has a record.
     epochs = cell.spec.epochs
     if loop.snapshot:
         writer.arrays(loop.snapshot)
@@ -121,7 +137,7 @@ def _train(
         try:
             metrics = loop.run_epoch()
         except Divergence as error:
-            _record_checkpoints(writer, folder)
+            _record_checkpoints(writer, folder, _last_name(epochs, loop.epoch))
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
@@ -129,20 +145,30 @@ def _train(
             writer.arrays(loop.snapshot)
         if loop.improved:
             save_checkpoint(folder / BEST, loop.best_state_dict())
-        save_checkpoint(folder / LAST, loop.state_dict())
+        last = folder / _last_name(epochs, loop.epoch)
+        save_checkpoint(last, loop.state_dict())
+        writer.artifact(LAST, last)
         on_event(Event("epoch", cell, writer.run_id, loop.epoch, epochs, metrics))
     metrics, arrays = loop.final_evaluation()
     writer.final(loop.epoch, metrics)
     writer.arrays(arrays)
-    _record_checkpoints(writer, folder)
+    _record_checkpoints(writer, folder, LAST)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
 
 
-def _record_checkpoints(writer: RunWriter, folder: Path) -> None:
-    for name in (BEST, LAST):
-        if (folder / name).exists():
-            writer.artifact(name, folder / name)
+def _last_name(epochs: int, epoch: int) -> str:
+    """Return the name of the checkpoint file of an epoch; that of the final one is LAST."""
+    return LASTS[(epochs - epoch) % 2]
+
+
+def _record_checkpoints(writer: RunWriter, folder: Path, last: str) -> None:
+    """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left there."""
+    for name, file in ((BEST, BEST), (LAST, last)):
+        if (folder / file).exists():
+            writer.artifact(name, folder / file)
+    for stray in (*folder.glob(".*.partial"), *(folder / name for name in LASTS if name != last)):
+        stray.unlink(missing_ok=True)
 
 
 @contextmanager

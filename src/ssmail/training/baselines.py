@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.envs.integrator import Integrator
-from ssmail.training.learner import Stateful
+from ssmail.training.checkpoint import Stateful
 
 
 class Baseline:
