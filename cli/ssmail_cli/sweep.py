@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, sentence
+from ssmail.errors import ExitCode, InputError, SsmailError, sentence
 from ssmail.execution import Resume
 from ssmail_cli.options import is_missing
-from ssmail_cli.output import chosen_format, note, print_rows
+from ssmail_cli.output import chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.run_table import key_metrics, rows_with_metrics
 
@@ -43,15 +43,32 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str
 
 
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:
-    """Return a row for each cell, in the order of the sweep; a cell that failed before its run began has no run."""
-    runs = store.runs(ids=[event.run_id for event in events if event.run_id])
+    """Return a row for each cell, in the order of the sweep; a cell that failed before its run began has no run.
+
+    A run that was deleted during the sweep, as with the whole database, has failed, whatever its last event says.
+    """
     names = [*key_metrics(cell.spec.environment for cell in sweep), "best_epoch"]
-    stored = {row["id"]: row for row in rows_with_metrics(store, runs, names)}
-    return [
-        {**names, "outcome": event.kind, "message": event.message}
-        | stored.get(event.run_id, {"run": None, "state": None})
-        for names, event in zip(sweep.values(), events, strict=True)
-    ]
+    stored = {row["id"]: row for row in _rows_still_stored(store, {event.run_id for event in events}, names)}
+    lost = f"its run is no longer in {store.where}: it was deleted, or the database replaced, meanwhile"
+    rows = []
+    for labels, event in zip(sweep.values(), events, strict=True):
+        row = {**labels, "outcome": event.kind, "message": event.message}
+        if event.run_id and event.run_id not in stored and event.kind not in ("failed", "interrupted"):
+            row |= {"outcome": "failed", "message": lost}
+        rows.append(row | stored.get(event.run_id, {"run": None, "state": None}))
+    return rows
+
+
+def _rows_still_stored(store: "Store", run_ids: set[str | None], names: Sequence[str]) -> Rows:
+    """Return the rows of those of these runs that are in the database which has its name now."""
+    store.close()  # its connections may be to a file that has been removed
+    if is_missing(store.where):
+        return []
+    try:
+        return rows_with_metrics(store, [run for run in store.runs() if run.id in run_ids], names)
+    except SsmailError as error:
+        note(error_line(error))
+        return []
 
 
 def is_interrupted(rows: Rows) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from ssmail.store import Store
-from ssmail.training.loop import load_checkpoint
+from ssmail.training.checkpoint import load_checkpoint
 
 CLOCKS = ("seconds",)  # the metrics that measure time
 

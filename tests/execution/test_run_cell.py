@@ -1,11 +1,15 @@
 """One cell in this process: what is stored, and that a death at any moment changes no number."""
 
+import errno
+import os
+import sqlite3
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from ssmail.config.experiments import build_spec
 from ssmail.data.expert_sets import save
@@ -15,6 +19,7 @@ from ssmail.execution import run_cell as module
 from ssmail.execution.cells import Cell, Event, Job, RunSettings
 from ssmail.execution.run_cell import MakeLoop, run_cell
 from ssmail.store import RunState, RunWriter, Store
+from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
 from ssmail.training.loop import TrainingLoop
 from tests.execution.fake_loop import Crashes, Diverges, OtherData, Walk
 from tests.execution.recorded import recorded
@@ -91,7 +96,9 @@ MOMENTS: dict[str, tuple[Any, str, int]] = {
     "before the final evaluation": (Walk, "final_evaluation", 1),
     "before the final metrics": (RunWriter, "final", 1),
     "before the arrays": (RunWriter, "arrays", 1),
-    "before the artifacts": (RunWriter, "artifact", 2),
+    "after the last checkpoint, before its record": (RunWriter, "artifact", 3),
+    "before the first record": (RunWriter, "artifact", 1),
+    "before the artifacts": (RunWriter, "artifact", 5),
     "before the end": (RunWriter, "finish", 1),
 }
 
@@ -257,11 +264,71 @@ def test_other_data_is_not_mixed_into_a_run(store: Store, cells: list[Cell]) -> 
 def test_a_damaged_checkpoint_is_bad_input_and_leaves_the_run_alone(store: Store, cells: list[Cell]) -> None:
     run(cells[0], store, stop_after=1)
     (before,) = store.runs()
-    (store.checkpoint_root / before.id / "last.pt").write_bytes(b"nothing")
+    (recorded,) = store.artifacts(before.id)
+    recorded.path.write_bytes(b"nothing")
     (event,) = run(cells[0], store)
     assert event.bad_input
-    assert "last.pt cannot be read" in event.message
+    assert f"{recorded.path} has been altered since it was recorded" in event.message
     assert store.runs() == [before]
+
+
+def test_a_checkpoint_that_does_not_fit_is_bad_input_and_leaves_the_run_alone(store: Store, tmp_path: Path) -> None:
+    cell = Cell(build_spec("bc", "yjunction", "smoke", ["training.epochs=3", "training.updates=1"]), 0)
+    run(cell, store, stop_after=1, loop=TrainingLoop)
+    (before,) = store.runs()
+    (recorded,) = store.artifacts(before.id)
+    state = load_checkpoint(recorded.path)
+    state["learner"]["optimizer"]["state"][0]["exp_avg"] = torch.zeros(3)
+    save_checkpoint(recorded.path, state)
+    altered = run(cell, store, loop=TrainingLoop)[-1]
+    assert "has been altered since it was recorded" in altered.message
+    connection = sqlite3.connect(store.where)  # as one that recorded nothing, or something else
+    with connection:
+        connection.execute("DELETE FROM artifact")
+    connection.close()
+    recorded.path.rename(recorded.path.with_name("last.pt"))
+    (event,) = run(cell, store, loop=TrainingLoop)
+    assert event.bad_input
+    assert "last.pt does not fit its run (learner.optimizer.0.exp_avg has another shape or type); sta" in event.message
+    assert store.runs() == [before]
+
+
+def test_the_record_of_a_checkpoint_names_no_file_elsewhere(store: Store, cells: list[Cell], tmp_path: Path) -> None:
+    run(cells[0], store, stop_after=1)
+    connection = sqlite3.connect(store.where)
+    with connection:
+        connection.execute("UPDATE artifact SET path = ?", (str(tmp_path / "elsewhere" / "secret.pt"),))
+    connection.close()
+    save_checkpoint(tmp_path / "elsewhere" / "secret.pt", {})
+    (event, *_) = run(cells[0], store)
+    assert (event.kind, event.epoch) == ("resumed", 0)  # its own last.pt does not exist
+
+
+def test_a_run_that_has_ended_leaves_only_what_it_recorded(store: Store, cells: list[Cell]) -> None:
+    run(cells[0], store, stop_after=2)
+    (row,) = store.runs()
+    folder = store.checkpoint_root / row.id
+    (folder / ".last.pt.1234.partial").write_bytes(b"of a process that was killed")
+    run(cells[0], store)
+    assert {path.name for path in folder.iterdir()} == {"best.pt", "last.pt"}
+
+
+def test_a_full_disk_fails_in_a_sentence_and_the_run_can_be_resumed(
+    store: Store, cells: list[Cell], undisturbed: tuple[Any, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pathlib.Path.write_bytes", full)
+        event = run(cells[0], store)[-1]
+    assert event.kind == "failed"
+    assert event.message.startswith("cannot write the checkpoint ")
+    assert event.message.endswith("(No space left on device); free or choose another place")
+    (row,) = store.runs()
+    assert row.state is RunState.FAILED
+    assert run(cells[0], store)[-1].kind == "finished"
+    assert recorded(store, row.id) == undisturbed
 
 
 def test_a_run_taken_over_stops_without_harm(store: Store, cells: list[Cell], monkeypatch: pytest.MonkeyPatch) -> None:

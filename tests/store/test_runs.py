@@ -14,6 +14,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunRow, RunState, RunWriter, Store
 
+STORED_TIME = "%Y-%m-%d %H:%M:%S.%f"
 NOT_FINITE = {"nan": math.nan, "up": math.inf, "down": -math.inf}
 
 
@@ -234,6 +235,41 @@ def test_silence_is_found(store: Store, writer: RunWriter) -> None:
     assert not store.is_alive(row)
     store.stale_seconds = 0
     assert store.mark_stale() == []  # it is interrupted already
+
+
+def set_heartbeat(store: Store, ahead: timedelta) -> None:
+    with sqlite3.connect(store.where) as connection:
+        connection.execute("UPDATE run SET heartbeat = ?", ((datetime.now(UTC) + ahead).strftime(STORED_TIME),))
+    connection.close()
+
+
+def test_a_heartbeat_far_in_the_future_is_of_a_dead_process(store: Store, spec: RunSpec, writer: RunWriter) -> None:
+    set_heartbeat(store, timedelta(seconds=10))  # another machine's clock may be ahead by some seconds
+    assert store.is_alive(only(store))
+    assert store.mark_stale() == []
+    with pytest.raises(InputError, match=r"last heartbeat (10|9) s ahead of this clock\); .* try again in (41|40) s$"):
+        store.delete([writer.run_id])
+    set_heartbeat(store, timedelta(days=1))  # the clock was set back
+    assert not store.is_alive(only(store))
+    store.resume_run(writer.run_id, 0)
+    set_heartbeat(store, timedelta(days=1))
+    (found,) = store.mark_stale()
+    row = only(store)
+    assert (found.id, row.state) == (writer.run_id, RunState.INTERRUPTED)
+    assert row.error is not None
+    assert row.error.startswith("its last heartbeat, of 20")
+    assert row.error.endswith(" UTC, was ahead of the clock")
+    store.delete([writer.run_id])
+    assert store.runs() == []
+
+
+def test_a_process_at_work_goes_on_after_the_clock_is_set_back(store: Store, writer: RunWriter) -> None:
+    set_heartbeat(store, timedelta(days=1))
+    writer.heartbeat()
+    assert store.is_alive(only(store))
+    writer.epoch(1, {"a": 1.0})
+    writer.finish(RunState.FINISHED)
+    assert 0 <= only(store).wall_seconds < 60
 
 
 def test_a_heartbeat_moves_the_last_sign_of_life(store: Store, writer: RunWriter) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from ssmail.errors import InputError, masked
+from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Job, Kind, RunSettings
 from ssmail.execution.planning import check_labels, plan_cell
@@ -198,7 +198,8 @@ class _Pool:
     def _report_dead_worker(self, worker: _Worker, ended: str) -> None:
         last, stopped = worker.last, self.stop_signals > 0
         if last.run_id is not None:
-            self._store.end_dead_run(last.run_id, RunState.INTERRUPTED if stopped else RunState.FAILED, ended)
+            with suppress(SsmailError):  # the database may be gone, too
+                self._store.end_dead_run(last.run_id, RunState.INTERRUPTED if stopped else RunState.FAILED, ended)
         kind: Kind = "interrupted" if stopped else "failed"
         self.emit(worker.index, Event(kind, worker.cell, last.run_id, last.epoch, last.epochs, message=ended))
 

@@ -15,7 +15,9 @@ from ssmail.execution.cells import Cell, Event
 from ssmail.store import RunRow, RunState, Store
 
 LAST, BEST = "last.pt", "best.pt"
-"""Names of the checkpoint files in checkpoint_root/<run id>/."""
+"""Names of the checkpoints of a run."""
+LASTS = (LAST, "last.2.pt")
+"""Names of the two files in checkpoint_root/<run id>/ that hold LAST in turn while the run is trained."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +54,13 @@ def plan_cell(store: Store, cell: Cell, resume: Resume) -> Plan:
         epoch = epochs if row.state is RunState.FINISHED else 0
         message = f"{row.state} already, as run {row.name}"
         return Plan(skipped=Event("skipped", cell, row.id, epoch, epochs, message=message))
-    if resume is Resume.REQUIRE and (row is None or not (store.checkpoint_root / row.id / LAST).exists()):
+    if resume is Resume.REQUIRE and (row is None or not _has_checkpoint(store, row)):
         raise InputError(f"seed {cell.seed} of this spec has no run to resume in {store.where}; use --resume auto")
     return Plan(row=row)
+
+
+def _has_checkpoint(store: Store, row: RunRow) -> bool:
+    return any((store.checkpoint_root / row.id / name).exists() for name in LASTS)
 
 
 def _check_data(cell: Cell, row: RunRow) -> None:

@@ -1,5 +1,6 @@
 """Computes one cell in this process: trains, stores metrics and checkpoints, and resumes an unfinished run."""
 
+import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator
@@ -13,10 +14,11 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
-from ssmail.execution.planning import BEST, LAST, Plan, plan_cell
+from ssmail.execution.planning import BEST, LAST, LASTS, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
 from ssmail.store.checkpoint_files import run_folder
-from ssmail.training.loop import Divergence, TrainingLoop, load_checkpoint, save_checkpoint
+from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
+from ssmail.training.loop import Divergence, TrainingLoop
 
 
 class Loop(Protocol):
@@ -95,10 +97,24 @@ def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
-    last = run_folder(store.checkpoint_root, plan.row.id) / LAST
-    if last.exists():
-        loop.load_state_dict(load_checkpoint(last))
+    _load_last(store, plan.row.id, loop)
     return store.resume_run(plan.row.id, loop.epoch)
+
+
+def _load_last(store: Store, run_id: str, loop: Loop) -> None:
+    """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
+    folder = run_folder(store.checkpoint_root, run_id)
+    recorded = [row for row in store.artifacts(run_id) if row.name == LAST]
+    sha256 = recorded[0].sha256 if recorded else None  # runs of older versions record it at their end only
+    last = recorded[0].path if recorded else folder / LAST
+    if last is None or last.name not in LASTS:
+        raise InputError(f"run {run_id[:8]} has its checkpoint recorded in another folder; {AFRESH}")
+    if not os.path.lexists(last):
+        return
+    try:
+        loop.load_state_dict(load_checkpoint(last, sha256))
+    except UnfitState as error:
+        raise InputError(f"the checkpoint {last} does not fit its run ({error}); {AFRESH}") from error
 
 
 def _train(
@@ -108,8 +124,9 @@ def _train(
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Event:
-    # Each epoch is written in this order: metrics, arrays, checkpoint. So a checkpoint is never ahead of the database,
-    # and what a killed process stored after its last checkpoint is computed again, to the same bits.
+    # Each epoch is written in this order: metrics, arrays, checkpoint, and the checkpoint's record. So a recorded
+    # checkpoint is never ahead of the database, and what a killed process stored after it is computed again, to the
+    # same bits. Two files take turns: the recorded one stays until the next one has a record.
     epochs = cell.spec.epochs
     if loop.snapshot:
         writer.arrays(loop.snapshot)
@@ -120,7 +137,7 @@ def _train(
         try:
             metrics = loop.run_epoch()
         except Divergence as error:
-            _record_checkpoints(writer)
+            _record_checkpoints(writer, _last_name(epochs, loop.epoch))
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
@@ -128,20 +145,30 @@ def _train(
             writer.arrays(loop.snapshot)
         if loop.improved:
             save_checkpoint(writer.folder / BEST, loop.best_state_dict())
-        save_checkpoint(writer.folder / LAST, loop.state_dict())
+        last = _last_name(epochs, loop.epoch)
+        save_checkpoint(writer.folder / last, loop.state_dict())
+        writer.artifact(LAST, last)
         on_event(Event("epoch", cell, writer.run_id, loop.epoch, epochs, metrics))
     metrics, arrays = loop.final_evaluation()
     writer.final(loop.epoch, metrics)
     writer.arrays(arrays)
-    _record_checkpoints(writer)
+    _record_checkpoints(writer, LAST)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
 
 
-def _record_checkpoints(writer: RunWriter) -> None:
-    for name in (BEST, LAST):
-        if (writer.folder / name).exists():
-            writer.artifact(name)
+def _last_name(epochs: int, epoch: int) -> str:
+    """Return the name of the checkpoint file of an epoch; that of the final one is LAST."""
+    return LASTS[(epochs - epoch) % 2]
+
+
+def _record_checkpoints(writer: RunWriter, last: str) -> None:
+    """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left there."""
+    for name, file in ((BEST, BEST), (LAST, last)):
+        if (writer.folder / file).exists():
+            writer.artifact(name, file)
+    for stray in (*writer.folder.glob(".*.partial"), *(writer.folder / name for name in LASTS if name != last)):
+        stray.unlink(missing_ok=True)
 
 
 @contextmanager

@@ -181,14 +181,18 @@ def explained_errors(where: str) -> Iterator[None]:
     try:
         yield
     except (DBAPIError, sqlite3.Error) as error:
-        raise _explained(str(error.orig if isinstance(error, DBAPIError) else error), where) from error
+        raise explained(str(error.orig if isinstance(error, DBAPIError) else error), where) from error
 
 
-def _explained(reason: str, where: str) -> SsmailError:
+def explained(reason: str, where: str) -> SsmailError:
+    """Return the error that says in one sentence what the database driver's `reason` means for the user."""
     if "not a database" in reason or "malformed" in reason:
         return InputError(f"{where} is not an SQLite database, or is damaged ({reason}); give another file")
     if "unable to open" in reason or "readonly" in reason:
-        return InputError(f"cannot write the database {where} ({reason}); choose a writable place")
+        return InputError(
+            f"cannot write the database {where} ({reason}), as even reading it requires; choose a writable place, or "
+            "copy it to one"
+        )
     if "locked" in reason:
         return SsmailError(f"another program locked the database {where} for {BUSY_SECONDS:.0f} s; close that program")
     return SsmailError(f"an operation on the database {where} failed: {reason}")

@@ -74,12 +74,15 @@ class RunRow:
 
     @property
     def silent_seconds(self) -> float:
-        """Seconds since the last heartbeat."""
+        """Seconds since the last heartbeat; negative if the clock was set back since, or another machine's is ahead."""
         return (datetime.now(UTC) - self.heartbeat).total_seconds()
 
     def is_alive(self, stale_seconds: float = STALE_SECONDS) -> bool:
-        """Return whether the run is RUNNING and its last heartbeat is younger than `stale_seconds`."""
-        return self.state is RunState.RUNNING and self.silent_seconds < stale_seconds
+        """Return whether the run is RUNNING and its last heartbeat is less than `stale_seconds` away from now.
+
+        One further in the future was sent before the clock was set back: a process at work would have sent others.
+        """
+        return self.state is RunState.RUNNING and abs(self.silent_seconds) < stale_seconds
 
 
 @dataclass(frozen=True)
@@ -112,9 +115,11 @@ def one_run(connection: Connection, run_id: str) -> RunRow:
 
 
 def silent_runs(connection: Connection, stale_seconds: float = STALE_SECONDS) -> list[RunRow]:
-    """Return the RUNNING runs whose last heartbeat is older than `stale_seconds`."""
-    limit = datetime.now(UTC) - timedelta(seconds=stale_seconds)
-    return runs(connection, schema.run.c.state == RunState.RUNNING, schema.run.c.heartbeat < limit)
+    """Return the RUNNING runs that are not alive (see RunRow.is_alive)."""
+    now, stale = datetime.now(UTC), timedelta(seconds=stale_seconds)
+    heartbeat = schema.run.c.heartbeat
+    silent = (heartbeat < now - stale) | (heartbeat > now + stale)
+    return runs(connection, schema.run.c.state == RunState.RUNNING, silent)
 
 
 def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow | None:

@@ -28,7 +28,7 @@ class Store:
 
     url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
     checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. stale_seconds: a
-    running run without a heartbeat for this long counts as dead.
+    running run whose last heartbeat is further from now than this counts as dead.
     """
 
     def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS) -> None:
@@ -95,10 +95,11 @@ class Store:
     def require_idle(self, row: RunRow) -> None:
         """Raise InputError when another process is computing the run."""
         if self.is_alive(row):
-            silent = max(0.0, row.silent_seconds)
+            silent = row.silent_seconds
+            when = f"{silent:.0f} s ago" if silent >= 0 else f"{-silent:.0f} s ahead of this clock"
             raise InputError(
                 f"seed {row.seed} of this spec is being computed by another process on {row.host} (run {row.name}, "
-                f"last heartbeat {silent:.0f} s ago); wait for it to end, or, if it was killed, try again in "
+                f"last heartbeat {when}); wait for it to end, or, if it was killed, try again in "
                 f"{self.stale_seconds - silent + 1:.0f} s"
             )
 
@@ -252,7 +253,11 @@ class Store:
 
 def _interrupt(connection: Connection, row: RunRow) -> None:
     """Mark a run whose process is silent as INTERRUPTED."""
-    error = f"its process fell silent after {row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+    ahead = row.silent_seconds < 0
+    error = (
+        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
+    )
     _end(connection, row.id, RunState.INTERRUPTED, error)
 
 

@@ -71,10 +71,11 @@ class RunWriter:
         rows = [{"run_id": self.run_id, "name": name, **arrays.encode(value)} for name, value in values.items()]
         self._replace(schema.array, rows)
 
-    def artifact(self, name: str) -> None:
-        """Record the file of that name in the run's folder, with its SHA-256."""
-        content = (self.folder / name).read_bytes()
-        row = {"name": name, "path": f"{self.run_id}/{name}", "size_bytes": len(content)}
+    def artifact(self, name: str, file: str | None = None) -> None:
+        """Record a file of the run's folder under `name`, by default the file of that name, with its SHA-256."""
+        file = file or name
+        content = (self.folder / file).read_bytes()
+        row = {"name": name, "path": f"{self.run_id}/{file}", "size_bytes": len(content)}
         self._replace(schema.artifact, [{"run_id": self.run_id, **row, "sha256": hashlib.sha256(content).hexdigest()}])
 
     def finish(self, state: RunState, error: str | None = None) -> None:

@@ -28,8 +28,9 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.training.actor_critic import ActorCritic
 from ssmail.training.batches import Batch, ReplayBuffer
+from ssmail.training.checkpoint import Stateful
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
-from ssmail.training.learner import LearnerContext, Stateful
+from ssmail.training.learner import LearnerContext
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
 from ssmail.training.rollout import PolicyPredictor
 
@@ -86,7 +87,7 @@ class AdversarialLearner:
             {**self.actor_critic.optimizers, "discriminator": self.optimizer},
             {**self.actor_critic.final_rates, "discriminator": self.adversarial.learning_rate_final},
         )
-        self.replay = ReplayBuffer(self.adversarial.replay)
+        self.replay = ReplayBuffer(self.adversarial.replay, self.experts)
 
     def networks(self) -> list[nn.Module]:
         """Return policy, critics and discriminator."""

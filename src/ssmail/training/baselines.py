@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.envs.integrator import Integrator
-from ssmail.training.learner import Reading, Stateful
+from ssmail.training.checkpoint import Stateful
+from ssmail.training.learner import Reading
 
 
 class Baseline:

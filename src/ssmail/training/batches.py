@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Trajectories
+from ssmail.training.checkpoint import UnfitState, fitted
 
 Arrays = dict[str, np.ndarray]
 """Arrays to store with a run, by name."""
@@ -55,10 +56,10 @@ class Batch:
 
 
 class ReplayBuffer:
-    """The last `capacity` generated trajectories."""
+    """The last `capacity` generated trajectories, which are as long and wide as those of `experts`."""
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
+    def __init__(self, capacity: int, experts: Batch) -> None:
+        self.capacity, self.experts = capacity, experts
         self.kept: Batch | None = None
 
     def add(self, batch: Batch) -> None:
@@ -77,8 +78,19 @@ class ReplayBuffer:
         return {} if self.kept is None else dict(vars(self.kept))
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
-        self.kept = Batch(**state) if state else None
+        """Inverse of `state_dict`. Raises UnfitState when it holds no trajectories like those of the experts."""
+        if state == {}:
+            self.kept = None
+            return
+        source = state.get("source") if isinstance(state, dict) else None
+        count = len(source) if isinstance(source, Tensor) and source.dim() == 1 else 0
+        if not 1 <= count <= self.capacity:
+            raise UnfitState("replay has another number of trajectories")
+        expected = {name: value[:1].expand(count, *value.shape[1:]) for name, value in vars(self.experts).items()}
+        kept = fitted(state, expected, "replay")
+        if not bool(((kept["source"] >= 0) & (kept["source"] < len(self.experts))).all()):
+            raise UnfitState("replay.source is out of range")
+        self.kept = Batch(**{name: value.to(self.experts.states.device) for name, value in kept.items()})
 
 
 def to_numpy(tensor: Tensor) -> Floats:

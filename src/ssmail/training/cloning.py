@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import required
-from ssmail.training.learner import LearnerContext, Stateful
+from ssmail.training.checkpoint import Stateful
+from ssmail.training.learner import LearnerContext
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
 from ssmail.training.rollout import PolicyPredictor
 

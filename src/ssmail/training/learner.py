@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import Protocol, TypedDict, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from ssmail.config.spec import RunSpec
 from ssmail.envs.integrator import Integrator
 from ssmail.training.batches import Batch
+from ssmail.training.checkpoint import Stateful
 from ssmail.training.seeding import Generators
 
 
@@ -60,18 +61,6 @@ class Predictor(Protocol):
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """Predict the mean of states[:, 1:] from states (B, T + 1, N, D), each from its true past: (B, T, N, D)."""
-        ...
-
-
-class Stateful(Protocol):
-    """Anything that a checkpoint saves: networks, optimizers, buffers."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state as tensors and plain data."""
-        ...
-
-    def load_state_dict(self, state: Any, /) -> object:
-        """Inverse of `state_dict`."""
         ...
 
 

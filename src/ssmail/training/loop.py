@@ -1,11 +1,10 @@
-"""The training loop: epochs of training and validation, the best model, landscapes, and checkpoints.
+"""The training loop: epochs of training and validation, the best model, landscapes, and the state to resume from.
 
 The loop returns metrics and does not know where they are stored.
 """
 
 import math
 import time
-import zipfile
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -14,14 +13,14 @@ from typing import Any
 import torch
 
 from ssmail.config.spec import RunSpec
-from ssmail.data.atomic_file import atomic_write
 from ssmail.data.expert_sets import generate, load
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import SsmailError
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
 from ssmail.training.batches import Arrays, Batch
+from ssmail.training.checkpoint import UnfitState, fitted, fitted_number, load_part
 from ssmail.training.cloning import CloningLearner
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
@@ -131,51 +130,31 @@ class TrainingLoop:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`, for a loop with the same spec and seed."""
-        self.epoch, self.best, self.snapshot = state["epoch"], state["best"], {}
-        for name, part in self.learner.parts().items():
-            part.load_state_dict(state["learner"][name])
+        """Inverse of `state_dict`, for a loop with the same spec and seed.
+
+        Raises UnfitState when the state is not one of such a loop; some of it may be loaded by then.
+        """
+        parts, best = self.learner.parts(), fitted(state.get("best"), self.state_dict()["best"], "best")
+        if state.keys() != self.state_dict().keys() or not isinstance(state["learner"], dict):
+            raise UnfitState("it has other entries")
+        if state["learner"].keys() != parts.keys():
+            raise UnfitState("learner has other entries")
+        self.epoch, self.snapshot = fitted_number(state["epoch"], 0, self.spec.epochs, "epoch"), {}
+        self.best = best | {"epoch": fitted_number(best["epoch"], 0, self.epoch, "best.epoch")}
+        for name, part in parts.items():
+            load_part(part, state["learner"][name], f"learner.{name}")
         self.generators.load_state_dict(state["generators"])
+        if not self._is_finite():
+            raise UnfitState("a weight is not finite")
 
     def best_state_dict(self) -> dict[str, Any]:
         """Return the weights with the best validation error so far, with their epoch and error."""
         return {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
 
     def _check_finite(self) -> None:
-        for network in self.learner.networks():
-            if not all(bool(torch.isfinite(p).all()) for p in network.parameters()):
-                raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
+        if not self._is_finite():
+            raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
 
-
-def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
-    """Write `state` (nested dicts and lists of tensors and plain data) to `path` and create its folder.
-
-    The write is atomic: after a crash or a power cut the file is either the old one or the new one. Raises InputError
-    if the file cannot be written.
-    """
-    try:
-        with atomic_write(path) as partial, partial.open("wb") as file:
-            torch.save(state, file)
-    except OSError as error:
-        raise InputError(
-            f"cannot write the checkpoint {path} ({error.strerror}); free or choose another place"
-        ) from error
-
-
-def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Return the state that `save_checkpoint` wrote, on the CPU, without running any code that the file holds.
-
-    Raises InputError if the file is missing or damaged.
-    """
-    try:
-        with zipfile.ZipFile(path) as archive:  # torch does not verify the checksums that it writes
-            if archive.testzip() is not None:
-                raise zipfile.BadZipFile("wrong checksum")
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # damaged bytes can make the unpickler raise anything
-        raise InputError(
-            f"the checkpoint {path} cannot be read ({type(error).__name__}); start afresh with --resume never"
-        ) from error
-    if not isinstance(state, dict):
-        raise InputError(f"{path} is not a checkpoint of ssmail; start afresh with --resume never")
-    return state
+    def _is_finite(self) -> bool:
+        parameters = (p for network in self.learner.networks() for p in network.parameters())
+        return all(bool(torch.isfinite(p).all()) for p in parameters)

@@ -5,6 +5,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from ssmail.training.checkpoint import UnfitState, fitted_generator
+
 PURPOSES = ("data", "weights", "policy", "alpha", "curriculum", "evaluation")
 
 
@@ -27,6 +29,8 @@ class Generators:
         return {p: g.get_state() for p, g in self.by_purpose.items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`."""
+        """Inverse of `state_dict`, for the same seed. Raises UnfitState when it is another one, or no such state."""
+        if not isinstance(state, dict) or state.keys() != self.by_purpose.keys():
+            raise UnfitState("generators has other entries")
         for purpose, generator in self.by_purpose.items():
-            generator.set_state(state[purpose])
+            generator.set_state(fitted_generator(state[purpose], generator, f"generators.{purpose}"))

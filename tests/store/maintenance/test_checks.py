@@ -50,6 +50,14 @@ def test_a_run_that_is_being_computed_is_no_problem(store: Store) -> None:
     assert (problem.check, problem.subject) == ("stale", store.runs()[0].id)
 
 
+def test_a_database_that_cannot_be_opened_is_not_called_damaged(filled: Path) -> None:
+    """As on a read-only mount, where SQLite cannot make the file beside a WAL database that reading requires."""
+    filled.with_name(filled.name + "-wal").unlink(missing_ok=True)
+    filled.with_name(filled.name + "-wal").mkdir()
+    with pytest.raises(InputError, match=r"cannot write the database .* as even reading it requires; choose"):
+        check(filled)
+
+
 def without_run(path: Path) -> str:
     change(path, "DELETE FROM run WHERE id = ?", first_run(path))
     shutil.rmtree(path.parent / "checkpoints")

@@ -12,7 +12,7 @@ from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError, command_line
 from ssmail.store import arrays, queries, schema
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
-from ssmail.store.connection import revision_of
+from ssmail.store.connection import explained, revision_of
 from ssmail.store.maintenance.sqlite_file import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
@@ -45,6 +45,8 @@ def check(where: str | Path) -> list[Problem]:
     except DBAPIError as error:
         if "not a database" in str(error.orig):
             raise InputError(f"{path} is not an SQLite database ({error.orig}); give another file") from error
+        if any(words in str(error.orig) for words in ("unable to open", "readonly", "locked")):
+            raise explained(str(error.orig), str(path)) from error
         return [_damage(path, str(error.orig))]
 
 
