@@ -300,8 +300,9 @@ def test_the_record_of_a_checkpoint_names_no_file_elsewhere(store: Store, cells:
         connection.execute("UPDATE artifact SET path = ?", (str(tmp_path / "elsewhere" / "secret.pt"),))
     connection.close()
     save_checkpoint(tmp_path / "elsewhere" / "secret.pt", {})
-    (event, *_) = run(cells[0], store)
-    assert (event.kind, event.epoch) == ("resumed", 0)  # its own last.pt does not exist
+    (event,) = run(cells[0], store)
+    assert event.bad_input
+    assert "has its checkpoint recorded in another folder; start afresh" in event.message
 
 
 def test_a_run_that_has_ended_leaves_only_what_it_recorded(store: Store, cells: list[Cell]) -> None:
