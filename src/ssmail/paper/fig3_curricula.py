@@ -125,9 +125,7 @@ def draw(record: CurriculaRecord) -> Figure:
         handles = []
         for shown, marker in zip(record.bands, cycle("so^Dv"), strict=False):
             look = {"ls": "-", "marker": marker, "markevery": 0.15, "mew": 0, "alpha": 0.75}
-            line = curves.draw_band(axes, shown, strokes[shown.label], **look)
-            line.set_label(curves.count_label(shown))
-            handles.append(line)
+            handles.append(curves.draw_band(axes, shown, strokes[shown.label], **look))
         for shown, curve in zip(record.bands, record.expected, strict=True):
             (line,) = axes.plot(curve.epochs, curve.values, color=style.REFERENCE, lw=0.8, ls=DASHES, zorder=4)
             line.set_gid(f"closed-form-{shown.label}")

@@ -226,5 +226,4 @@ def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> d
     handles = {}
     for shown in panel.bands:
         handles[shown.label] = curves.draw_band(axes, shown, strokes[shown.label])
-        handles[shown.label].set_label(curves.count_label(shown))
     return handles
