@@ -28,7 +28,7 @@ from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads, Selection
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig3"
@@ -74,16 +74,15 @@ def collect(store: Store, selection: Selection, statistic: Statistic) -> Curricu
     expected = store.metrics([run.id for run in selection.runs], names=[EXPECTED])
     return CurriculaRecord(
         bands=curves.bands(store, selection, [MEASURED], statistic),
-        expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
+        expected=tuple(
+            # of the run with the most epochs, for it is the same for every seed
+            max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
+            for group in selection.groups
+        ),
         statistic=statistic,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=selection.notes,
     )
-
-
-def _longest(group: Group, expected: pd.DataFrame, statistic: Statistic) -> Curve:
-    """The closed form of the run with the most epochs; it is the same for every seed."""
-    return max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
 
 
 def growth(lengths: Floats) -> float:
