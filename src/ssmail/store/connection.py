@@ -223,8 +223,12 @@ def _upgrade(engine: Engine) -> None:
     config = Config()
     config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
     with writing(engine) as connection:
-        if revision_of(connection, engine) != REVISIONS[-1]:  # another process may have upgraded it meanwhile
-            config.attributes["connection"] = connection
+        config.attributes["connection"] = connection
+        revision = revision_of(connection, engine)
+        if revision is None:
+            metadata.create_all(connection)
+            command.stamp(config, "head")
+        elif revision != REVISIONS[-1]:  # another process may have upgraded it meanwhile
             command.upgrade(config, "head")
 
 
