@@ -54,12 +54,24 @@ DIGEST = re.compile("[0-9a-f]{64}")
 def generate(data: DataSpec) -> ExpertSet:
     """Generate the expert set of the environment in spec.GENERATED_ENVIRONMENTS whose parameters `data` has.
 
-    Raises InputError for parameters that no set can have.
+    Raises InputError for parameters that no set can have, or only one that is too large for a file.
     """
     if data.letters is not None:
+        _check_size("letters", data.letters, len(data.letters.word), arrays=2)
         return letters.generate(data.letters)
     assert data.yjunction is not None
+    _check_size("yjunction", data.yjunction, data.yjunction.agents, arrays=2 + len(yjunction.LANES))
     return yjunction.generate(data.yjunction)
+
+
+def _check_size(environment: str, params: LettersSpec | YJunctionSpec, agents: int, arrays: int) -> None:
+    """Raise InputError if the `arrays` (B, T, N, 2) of all splits would be too large for a file."""
+    size = 8 * 2 * arrays * params.steps * agents * sum(getattr(params, split) for split in SPLITS)
+    if size > LARGEST_FILE:
+        raise InputError(
+            f"the expert set would have more than {LARGEST_FILE >> 30} GB; lower data.{environment}.train, validation, "
+            "test or steps"
+        )
 
 
 def check_target(path: Path, *, force: bool) -> None:
@@ -187,14 +199,17 @@ class _File:
         if size > LARGEST_FILE or len(members) > MOST_ARRAYS:
             raise self.fault(f"{path} is larger than any expert set of ssmail")
         for member in members:
+            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
+                raise self.fault(
+                    f"{member.filename!r:.40} in {path} is compressed or encrypted, which ssmail never does"
+                )
+        if sum(member.file_size for member in members) > size:  # as members that lie on one another do
+            raise self.fault(f"{path} declares more than it holds")
+        for member in members:
             key = member.filename.removesuffix(".npy")
             if key in self.headers:
                 raise self.fault(f"{path} holds the array {key!r:.40} twice")
-            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
-                raise self.fault(f"{key!r:.40} in {path} is compressed or encrypted, which ssmail never does")
             self.headers[key] = self._header(key, member)
-        if sum(member.file_size for member in members) > size:  # members that lie on one another
-            raise self.fault(f"{path} declares more than it holds")
 
     def _header(self, key: str, member: zipfile.ZipInfo) -> _Header:
         """Read the header of a .npy member, which numpy would evaluate as Python."""
