@@ -460,7 +460,7 @@ FORGED: dict[str, tuple[Callable[[ExpertSet], dict[str, Any]], str]] = {
     "enormous": (lambda experts: {"test": times(experts.test, 1e200)}, "too large or too small to be scaled"),
     "still": (lambda experts: {"train": times(experts.train, 0)}, "too large or too small to be scaled"),
     "trial": (
-        lambda experts: {"test": dataclasses.replace(experts.test, trial=experts.test.trial + 10**9)},
+        lambda experts: {"test": dataclasses.replace(experts.test, trial=experts.test.trial + 2**62)},
         "test/trial in .* holds a number that it cannot hold",
     ),
     "frame": (

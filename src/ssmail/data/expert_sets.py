@@ -13,7 +13,7 @@ import os
 import re
 import shlex
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ OTHER_ARRAYS = {
 }  # of a file, beside those of the splits, `parameters` and `hash`
 
 LARGEST_FILE, MOST_ARRAYS = 2**31, 64  # bytes; members
+LARGEST_NUMBER = 2**40  # of a trial or a frame
 LONGEST_TEXT, LONGEST_HEADER = 2**22, 2**10  # bytes of a text, and of what .npy declares about an array
 MAGIC = b"\x93NUMPY\x01\x00"  # of the only version that such arrays need; the header's length follows in two bytes
 HEADER = re.compile(
@@ -262,17 +263,17 @@ class _File:
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
         return array
 
-    def whole_numbers(self, key: str, count: int, allowed: Iterable[int] | None) -> Any:
-        """Return an array (count,) of those numbers that are `allowed`; of any from 0 on if that is None."""
+    def whole_numbers(self, key: str, count: int, below: int) -> Any:
+        """Return an array (count,) of numbers from 0 on, all less than `below`."""
         array = self.array(key, (count,), np.int64)
-        if not (array >= 0 if allowed is None else np.isin(array, list(allowed))).all():
+        if array.min() < 0 or array.max() >= below:
             raise self.fault(f"{key} in {self.path} holds a number that it cannot hold")
         return array
 
     def motion(self, split: str, shape: tuple[int, ...], modes: int = 1) -> tuple[Any, Any, Any]:
         """Return positions and velocities of this shape (B, T, N, P), and the modes (B,), of a split."""
         positions, velocities = (self.array(f"{split}/{name}", shape, np.float64) for name in FIELDS["letters"][:2])
-        return positions, velocities, self.whole_numbers(f"{split}/mode", shape[0], range(modes))
+        return positions, velocities, self.whole_numbers(f"{split}/mode", shape[0], modes)
 
     def text(self, key: str) -> str:
         """Return an array that is a single text."""
@@ -320,9 +321,8 @@ def _read_mocap(file: _File, _: dict[str, Any]) -> ExpertSet:
     for split in SPLITS:
         windows = max(1, file.header(f"{split}/trial").count)
         positions, velocities, _ = file.motion(split, (windows, params.window_of(split), len(joints), 3))
-        trials = file.whole_numbers(f"{split}/trial", windows, getattr(params, split))
-        frames = file.whole_numbers(f"{split}/frame", windows, None)
-        splits[split] = Trajectories.single_mode(positions, velocities, trials, frames)
+        cut = (file.whole_numbers(f"{split}/{name}", windows, LARGEST_NUMBER) for name in ("trial", "frame"))
+        splits[split] = Trajectories.single_mode(positions, velocities, *cut)
     sources = file.json("sources")
     if not all(isinstance(digest, str) and DIGEST.fullmatch(digest) for digest in sources.values()):
         raise file.fault(f"the sources inside {file.path} are not the digests of files")
