@@ -6,13 +6,15 @@ import pytest
 from ssmail.config.experiments import build_spec, figure_requirements
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import USABLE
-from ssmail.paper.fig1_landscapes import collect, draw
+from ssmail.paper.fig1_landscapes import draw
 from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 
 from .conftest import AddRun
 from .handmade_landscapes import landscapes, linear, rollouts, step
+
+collect = FIGURES["fig1"].collect
 
 
 @pytest.fixture

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.paper.fig2_vector_field import AWAY, TOWARDS, collect, draw
+from ssmail.paper.fig2_vector_field import AWAY, TOWARDS, draw
 from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 
 from .conftest import AddRun
+
+collect = FIGURES["fig2"].collect
 
 COSINES = {"[0,1]": (-0.6, 0.2, -0.8), "[-1,1]": (0.9, 0.6, 0.8)}
 

@@ -12,7 +12,7 @@ from ssmail.config.experiments import ablation, ablation_specs
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper import fig3_curricula
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.plots import style
 from ssmail.store import RunState, Store
 
@@ -24,7 +24,7 @@ def filled(store: Store, ablate: Any) -> Store:
 
 
 def test_every_curriculum_is_measured_and_expected(filled: Store) -> None:
-    record = fig3_curricula.collect(filled)
+    record = FIGURES["fig3"].collect(filled)
     assert [band.label for band in record.bands] == list(ablation("curriculum").values)
     for band, closed in zip(record.bands, record.expected, strict=True):
         assert [curve.seed for curve in band.curves] == [0, 1]
@@ -36,16 +36,16 @@ def test_every_curriculum_is_measured_and_expected(filled: Store) -> None:
 
 def test_the_closed_form_is_that_of_the_run_with_most_epochs(store: Store, ablate: Any) -> None:
     ablate("curriculum", {"teacher-forcing": [None, 0.1]})  # the first seed diverged after one epoch
-    (closed,) = fig3_curricula.collect(store).expected
+    (closed,) = FIGURES["fig3"].collect(store).expected
     np.testing.assert_array_equal(closed.values, [1, 2, 3])
     assert closed.seed == 1
-    (band,) = fig3_curricula.collect(store).bands
+    (band,) = FIGURES["fig3"].collect(store).bands
     assert band.diverged == 1
     np.testing.assert_allclose(band.summary.centre, [1.1, np.nan, np.nan])
 
 
 def test_picture_and_csv_show_the_record(filled: Store, tmp_path: Path) -> None:
-    record = fig3_curricula.collect(filled, statistic=Statistic.MEDIAN_IQR)
+    record = FIGURES["fig3"].collect(filled, statistic=Statistic.MEDIAN_IQR)
     figure = fig3_curricula.draw(record)
     csv = pd.read_csv(save("curricula", record, figure, tmp_path)[-1])
     (axes,) = figure.axes
@@ -79,4 +79,4 @@ def test_a_run_without_segment_lengths_is_refused(store: Store, add_run: Any) ->
     spec = ablation_specs("curriculum", "smoke")["teacher-forcing"]
     run = add_run(0, state=RunState.INTERRUPTED, spec=spec)
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no curriculum/segment_length yet; "):
-        fig3_curricula.collect(store, [run])
+        FIGURES["fig3"].collect(store, [run])

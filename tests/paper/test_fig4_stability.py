@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, mean_interval, median_quartiles
 from ssmail.paper import fig4_stability
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.store import RunState, Store
 
 
@@ -32,12 +32,12 @@ def titles(figure: Figure) -> list[str]:
 
 
 def drawn(store: Store) -> Figure:
-    return fig4_stability.draw(fig4_stability.collect(store))
+    return fig4_stability.draw(FIGURES["fig4"].collect(store))
 
 
 def test_mean_and_std_are_over_all_seeds(store: Store, add_run: Any) -> None:
     runs = [add_run(0, [0.04, 0.02, 0.01]), add_run(1, [0.06, 0.02, 0.04])]
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     (band,) = record.bands
     assert [curve.run_id for curve in band.curves] == runs
     np.testing.assert_array_equal(band.curves[1].values, [0.06, 0.02, 0.04])
@@ -54,16 +54,16 @@ def test_the_statistic_can_be_chosen(store: Store, add_run: Any) -> None:
     for seed, values in enumerate(errors):
         add_run(seed, list(values))
     for statistic, expected in ((Statistic.MEDIAN_IQR, median_quartiles), (Statistic.MEAN_CI, mean_interval)):
-        record = fig4_stability.collect(store, statistic=statistic)
+        record = FIGURES["fig4"].collect(store, statistic=statistic)
         np.testing.assert_array_equal(record.bands[0].summary, expected(errors))
         assert statistic.words in fig4_stability.draw(record).legends[0].get_title().get_text()
-    assert "median" in set(fig4_stability.collect(store, statistic=Statistic.MEDIAN_IQR).table()["kind"])
+    assert "median" in set(FIGURES["fig4"].collect(store, statistic=Statistic.MEDIAN_IQR).table()["kind"])
 
 
 def test_a_single_run_has_no_band(store: Store, add_run: Any) -> None:
     add_run(0, [0.04, 0.02])
     for statistic in (Statistic.MEAN_STD, Statistic.MEAN_CI):
-        record = fig4_stability.collect(store, statistic=statistic)
+        record = FIGURES["fig4"].collect(store, statistic=statistic)
         np.testing.assert_array_equal(record.bands[0].summary.centre, [0.04, 0.02])
         figure = fig4_stability.draw(record)
         assert titles(figure) == ["ssail: 1 run"]
@@ -85,7 +85,7 @@ def test_a_diverged_seed_stays_in_the_statistic_and_is_marked(
 ) -> None:
     healthy = add_run(0, [0.04, 0.02, 0.01])
     lost = add_run(1, errors, RunState.DIVERGED)
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     (band,) = record.bands
     assert [curve.diverged_at for curve in band.curves] == [None, epoch]
     known = [e <= len(errors) and np.isfinite(errors[e - 1]) for e in (1, 2, 3)]
@@ -104,19 +104,19 @@ def test_the_median_goes_on_where_the_mean_is_lost(store: Store, add_run: Any) -
         add_run(seed, [level] * 3)
     add_run(3, [0.5], RunState.DIVERGED)
     add_run(4, [0.04, 0.04], RunState.INTERRUPTED)  # unfinished: not drawn by default
-    (band,) = fig4_stability.collect(store, statistic=Statistic.MEDIAN_IQR).bands
+    (band,) = FIGURES["fig4"].collect(store, statistic=Statistic.MEDIAN_IQR).bands
     np.testing.assert_allclose(band.summary.centre, [0.025, 0.025, 0.025])  # of 0.01, 0.02, 0.03 and infinity
     everything = [run.id for run in store.runs()]
-    (band,) = fig4_stability.collect(store, everything, statistic=Statistic.MEDIAN_IQR).bands
+    (band,) = FIGURES["fig4"].collect(store, everything, statistic=Statistic.MEDIAN_IQR).bands
     np.testing.assert_allclose(band.summary.centre, [0.03, 0.03, np.nan])  # what the unfinished run does is unknown
 
 
 def test_only_diverged_seeds_can_be_drawn(store: Store, add_run: Any) -> None:
     add_run(0, [], RunState.DIVERGED)
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     assert record.constant_velocity is None
     for statistic in Statistic:
-        figure = fig4_stability.draw(fig4_stability.collect(store, statistic=statistic))
+        figure = fig4_stability.draw(FIGURES["fig4"].collect(store, statistic=statistic))
         assert titles(figure) == ["ssail: 1 run, 1 diverged (x)"]
 
 
@@ -125,7 +125,7 @@ def test_the_csv_is_what_is_drawn(store: Store, add_run: Any, tmp_path: Path) ->
         add_run(seed, errors)
         add_run(seed, [5 * error for error in errors], method="gail")
     add_run(2, [0.05, 0.7], RunState.DIVERGED)
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     figure = fig4_stability.draw(record)
     csv = pd.read_csv(save("fig4", record, figure, tmp_path)[-1])
     assert set(csv["kind"]) == {"run", "mean", "diverged", "constant velocity"}
@@ -157,36 +157,36 @@ def same(line: Line2D, rows: pd.DataFrame) -> bool:
 def test_a_band_that_a_logarithm_cannot_show_is_cut_and_that_is_said(store: Store, add_run: Any) -> None:
     add_run(0, [0.1, 0.1])
     add_run(1, [0.2, 50.0])  # at epoch 2 the mean less the standard deviation is negative
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     low = record.bands[0].summary.low
     assert low[1] < 0 < low[0]
     band = band_of(fig4_stability.draw(record).axes[0])
     np.testing.assert_allclose([band[1][0], band[2][0]], [low[0], 0.1 / 3])
     assert record.notes[-1].startswith("the band of ssail is cut a factor 3 below the lowest run")
     add_run(1, [0.2, 0.12])
-    assert "is cut" not in " ".join(fig4_stability.collect(store).notes)
+    assert "is cut" not in " ".join(FIGURES["fig4"].collect(store).notes)
 
 
 def test_the_scale_ends_where_every_rollout_has_diverged(store: Store, add_run: Any) -> None:
     add_run(0, [0.1, 0.1])
     add_run(1, [0.2, 1e9])
-    record = fig4_stability.collect(store)
+    record = FIGURES["fig4"].collect(store)
     assert fig4_stability.draw(record).axes[0].get_ylim()[1] == 100
     assert "ssail: 1 of the runs rise above 100, where the scale ends." in record.notes
     assert 1e9 in set(record.table()["value"])
     add_run(1, [0.2, 99.0])
-    assert "where the scale ends" not in " ".join(fig4_stability.collect(store).notes)
+    assert "where the scale ends" not in " ".join(FIGURES["fig4"].collect(store).notes)
 
 
 def test_the_first_method_is_compared_with_the_others_by_an_exact_test(store: Store, add_run: Any) -> None:
     for seed in range(3):
         add_run(seed, [0.5, 0.01 + seed / 1000])
         add_run(seed, [0.5, 0.5 + seed], RunState.DIVERGED if seed == 2 else RunState.FINISHED, method="gail")
-    (found,) = (note for note in fig4_stability.collect(store).notes if "permutation" in note)
+    (found,) = (note for note in FIGURES["fig4"].collect(store).notes if "permutation" in note)
     assert found.startswith("ssail against gail at the last epoch: medians 0.011 and 1.5, exact two-sided")
     assert found.endswith("p = 0.1 (least possible 0.1).")
     unfinished = add_run(3, [0.5], RunState.INTERRUPTED, method="gail")
-    everything = fig4_stability.collect(store, [run.id for run in store.runs()])
+    everything = FIGURES["fig4"].collect(store, [run.id for run in store.runs()])
     assert unfinished in everything.provenance.run_ids
     assert "permutation" not in " ".join(everything.notes)  # its last epoch is unknown
 
@@ -197,7 +197,7 @@ def test_many_runs_and_runs_that_all_diverged_do_no_harm(store: Store, add_run: 
         add_run(seed, [], RunState.DIVERGED, method="wail")
     for seed in range(3):
         add_run(seed, [], RunState.DIVERGED, method="gail")
-    (found,) = (note for note in fig4_stability.collect(store).notes if "permutation" in note)
+    (found,) = (note for note in FIGURES["fig4"].collect(store).notes if "permutation" in note)
     assert found.startswith("ssail against gail at the last epoch: medians 0.1 and inf")
     assert len(drawn(store).axes) == 3
 
@@ -229,7 +229,7 @@ def test_the_axes_are_named_logarithmic_and_free_of_the_legend(store: Store, add
 
 def test_ids_draw_unfinished_runs_and_keep_specs_apart(store: Store, add_run: Any) -> None:
     ids = [add_run(0), add_run(0, [0.3], RunState.RUNNING, overrides=["sac.gamma=0.5"])]
-    record = fig4_stability.collect(store, ids)
+    record = FIGURES["fig4"].collect(store, ids)
     assert [len(band.curves) for band in record.bands] == [1, 1]
     figure = fig4_stability.draw(record)
     colours = [
@@ -238,4 +238,4 @@ def test_ids_draw_unfinished_runs_and_keep_specs_apart(store: Store, add_run: An
     assert colours[0] != colours[1]
     silent = add_run(1, [], RunState.RUNNING)
     with pytest.raises(InputError, match=rf"^run {silent[:8]} \(running\) has no train/mode_mse yet; "):
-        fig4_stability.collect(store, [silent])
+        FIGURES["fig4"].collect(store, [silent])

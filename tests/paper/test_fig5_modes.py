@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
 from ssmail.paper import fig5_modes
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.plots import style
 from ssmail.store import RunState, Store
 
@@ -33,7 +33,7 @@ def paths(axes: Axes, colour: str) -> list[np.ndarray]:
 
 def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, add_run: Any) -> None:
     runs = [add_run(0), add_run(1, shift=0.1)]
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     assert [(panel.label, panel.run_id, panel.seed) for panel in record.panels] == [
         ("ssail", runs[0], 0),
         ("ssail", runs[1], 1),
@@ -50,7 +50,7 @@ def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, a
 def test_the_shown_starts_are_spread_over_all(store: Store, add_run: Any) -> None:
     many = np.repeat(np.repeat(np.arange(100.0), 4).reshape(1, 100, 2, 1, 2), 2, axis=0)  # position = start
     add_run(0, test__rollouts=many, test__lanes=many)
-    (panel,) = fig5_modes.collect(store).panels
+    (panel,) = FIGURES["fig5"].collect(store).panels
     starts = panel.rollouts[:, 0, 0, 0]
     assert len(starts) == fig5_modes.STARTS
     assert (starts[0], starts[-1]) == (0, 99)
@@ -59,7 +59,7 @@ def test_the_shown_starts_are_spread_over_all(store: Store, add_run: Any) -> Non
 
 def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: Path) -> None:
     runs = [add_run(0), add_run(1, shift=0.1)]
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     figure = fig5_modes.draw(record)
     csv = pd.read_csv(save("modes", record, figure, tmp_path)[-1])
     colour = style.METHODS["ssail"].colour
@@ -85,12 +85,12 @@ def same(drawn: list[np.ndarray], rows: pd.DataFrame, keys: list[str]) -> bool:
 
 def test_the_frame_widens_for_rollouts_but_only_so_far(store: Store, add_run: Any) -> None:
     add_run(0)
-    tight = fig5_modes.collect(store).frame
+    tight = FIGURES["fig5"].collect(store).frame
     side = np.ptp(lanes().reshape(-1, 2), axis=0).max()
     wide = arrays()["test/rollouts"]
     wide[0, 0, 4, 0, 1] = lanes()[..., 1].max() + 0.15 * side
     add_run(0, test__rollouts=wide)
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     assert record.outside(record.panels[0]) == 0
     assert record.frame[3] == pytest.approx(lanes()[..., 1].max() + 0.2 * side)
     assert record.frame[:3] == tight[:3]
@@ -102,7 +102,7 @@ def test_what_leaves_the_frame_is_counted(store: Store, add_run: Any) -> None:
     wild[1, 1, 4, 1] = np.nan
     wild[0, 2, 4, 0, 0] = -np.inf
     add_run(0, test__rollouts=wild)
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     assert record.outside(record.panels[0]) == 3
     (axes,) = panels(fig5_modes.draw(record))
     assert words(axes)[-1] == "3 of 3 cut off"
@@ -112,7 +112,7 @@ def test_what_leaves_the_frame_is_counted(store: Store, add_run: Any) -> None:
 def test_a_diverged_seed_has_a_panel_that_says_so(store: Store, add_run: Any) -> None:
     add_run(0)
     lost = add_run(1, [0.5, np.inf], RunState.DIVERGED)
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     assert [panel.rollouts is None for panel in record.panels] == [False, True]
     first, second = panels(fig5_modes.draw(record))
     assert words(second) == ["seed 1", "diverged:", "no test rollouts"]
@@ -125,14 +125,14 @@ def test_a_diverged_seed_has_a_panel_that_says_so(store: Store, add_run: Any) ->
 def test_only_diverged_seeds_can_be_drawn(store: Store, add_run: Any) -> None:
     for seed in range(3):
         add_run(seed, [0.5], RunState.DIVERGED)
-    record = fig5_modes.collect(store)
+    record = FIGURES["fig5"].collect(store)
     assert [words(axes)[0] for axes in panels(fig5_modes.draw(record))] == ["seed 0", "seed 1", "seed 2"]
     assert list(record.table()["kind"]) == ["diverged"] * 3
 
 
 def test_two_groups_stand_in_two_columns(store: Store, add_run: Any) -> None:
     ids = [add_run(0), add_run(1), add_run(0, overrides=["sac.gamma=0.5"])]
-    figure = fig5_modes.draw(fig5_modes.collect(store, ids))
+    figure = fig5_modes.draw(FIGURES["fig5"].collect(store, ids))
     labels = [f"ssail {spec}" for spec in dict.fromkeys(run.spec_hash[:8] for run in store.runs())]
     places = {(words(axes)[0], axes.get_subplotspec().colspan.start) for axes in panels(figure)}
     assert places == {("seed 0", 0), ("seed 1", 0), ("seed 0", 1)}
@@ -143,7 +143,7 @@ def test_methods_stand_side_by_side_in_the_order_of_experiments_yaml(store: Stor
     for seed in range(2):
         for method in ("dnri", "ssail"):
             add_run(seed, method=method, shift=seed)
-    figure = fig5_modes.draw(fig5_modes.collect(store))
+    figure = fig5_modes.draw(FIGURES["fig5"].collect(store))
     assert [axes.get_title() for axes in panels(figure)] == ["ssail", "dnri", "", ""]
     for axes, method in zip(panels(figure), ("ssail", "dnri") * 2, strict=True):
         assert len(paths(axes, style.METHODS[method].colour)) == STARTS * AGENTS
@@ -155,4 +155,4 @@ def test_methods_stand_side_by_side_in_the_order_of_experiments_yaml(store: Stor
 def test_an_unfinished_run_is_refused(store: Store, add_run: Any) -> None:
     run = add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no test rollouts; "):
-        fig5_modes.collect(store, [run])
+        FIGURES["fig5"].collect(store, [run])

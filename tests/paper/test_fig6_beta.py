@@ -12,7 +12,7 @@ from ssmail.config.experiments import ablation_specs
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper import fig6_beta
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.store import RunState, Store
 
 RESULTS = {0.0: [0.4, 0.2, None], 0.05: [0.01, 0.02, 0.03], 1.0: [0.1, 0.1, 0.4]}
@@ -29,7 +29,7 @@ def lines(figure: Any, panel: int = 0) -> dict[str, Line2D]:
 
 
 def test_mean_and_std_are_over_all_seeds_and_lost_with_one(store: Store, runs: dict[float, list[str]]) -> None:
-    record = fig6_beta.collect(store)
+    record = FIGURES["fig6"].collect(store)
     first, second, third = record.columns
     assert [column.value for column in record.columns] == [0.0, 0.05, 1.0]
     assert [column.run_ids for column in record.columns] == [tuple(found) for found in runs.values()]
@@ -46,7 +46,7 @@ def test_mean_and_std_are_over_all_seeds_and_lost_with_one(store: Store, runs: d
 
 
 def test_the_median_counts_a_diverged_run_as_the_worst(store: Store, runs: dict[float, list[str]]) -> None:
-    record = fig6_beta.collect(store, statistic=Statistic.MEDIAN_IQR)
+    record = FIGURES["fig6"].collect(store, statistic=Statistic.MEDIAN_IQR)
     assert [float(column.error_summary.centre) for column in record.columns] == [0.4, 0.02, 0.1]
     assert record.columns[0].error_summary.high == np.inf
     assert np.isnan(record.columns[0].balance_summary.centre)  # its lane balance is unknown, not bad
@@ -56,7 +56,7 @@ def test_an_error_that_is_not_finite_counts_as_diverged(store: Store, add_run: A
     spec = ablation_specs("beta", "smoke", values=[0.0])[0.0]
     add_run(0, spec=spec, final={"test/mode_mse": np.nan})
     add_run(1, spec=spec, final={"test/mode_mse": 0.1})
-    (column,) = fig6_beta.collect(store).columns
+    (column,) = FIGURES["fig6"].collect(store).columns
     assert column.diverged == 1
     np.testing.assert_array_equal(column.balance, [0.25, 0.25])
     assert column.balance_summary.centre == 0.25
@@ -66,7 +66,7 @@ def test_an_error_that_is_not_finite_counts_as_diverged(store: Store, add_run: A
 def test_picture_and_csv_show_the_record(
     store: Store, runs: dict[float, list[str]], tmp_path: Path, statistic: Statistic
 ) -> None:
-    record = fig6_beta.collect(store, statistic=statistic)
+    record = FIGURES["fig6"].collect(store, statistic=statistic)
     figure = fig6_beta.draw(record)
     csv = pd.read_csv(save("beta", record, figure, tmp_path)[-1])
     upper, lower = figure.axes
@@ -88,7 +88,7 @@ def test_picture_and_csv_show_the_record(
 
 
 def test_the_axes_are_named_and_free_of_the_legend(store: Store, runs: dict[float, list[str]]) -> None:
-    figure = fig6_beta.draw(fig6_beta.collect(store))
+    figure = fig6_beta.draw(FIGURES["fig6"].collect(store))
     upper, lower = figure.axes
     assert [label.get_text() for label in lower.get_xticklabels()] == ["0", ".05", "1"]
     assert "evenly spaced" in lower.get_xlabel()
@@ -108,11 +108,11 @@ def test_the_axes_are_named_and_free_of_the_legend(store: Store, runs: dict[floa
 def test_a_single_run_and_only_diverged_ones_can_be_drawn(store: Store, ablate: Any) -> None:
     ablate("beta", {0.0: [None], 1.0: [0.1]})
     for statistic in Statistic:
-        figure = fig6_beta.draw(fig6_beta.collect(store, statistic=statistic))
+        figure = fig6_beta.draw(FIGURES["fig6"].collect(store, statistic=statistic))
         assert len(lines(figure)["diverged-0"].get_xdata()) == 1
 
 
 def test_an_unfinished_run_is_refused(store: Store, add_run: Any) -> None:
     run = add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no test error; "):
-        fig6_beta.collect(store, [run])
+        FIGURES["fig6"].collect(store, [run])

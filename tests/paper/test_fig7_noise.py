@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, mean_interval, median_quartiles
 from ssmail.paper import fig7_noise
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 
@@ -37,7 +37,7 @@ def runs(add_forecast: Any) -> list[str]:
 
 
 def test_mean_and_std_over_seeds_at_every_step(store: Store, runs: list[str]) -> None:
-    record = fig7_noise.collect(store)
+    record = FIGURES["fig7"].collect(store)
     assert record.provenance.run_ids == tuple(runs)
     assert [panel.condition for panel in record.panels] == ["clean", "noisy"]
     growth = 1 + np.arange(1, STEPS + 1) / 2
@@ -58,7 +58,7 @@ def test_slopes_are_those_of_the_last_half(store: Store, add_forecast: Any) -> N
     bent = np.array([9.0, 7.0, 8.0, 1.0, 2.0, 3.0]) / 1000  # rises by 0.001 a step in the last half alone
     add_forecast(0, 0.002, steps=STEPS, errors={"test/mse": bent})
     add_forecast(1, 0.006, steps=STEPS)  # straight: 0.003 a step
-    record = fig7_noise.collect(store)
+    record = FIGURES["fig7"].collect(store)
     (clean,), (noisy,) = (panel.slopes for panel in record.panels)
     np.testing.assert_allclose(clean.runs, [0.001, 0.003])
     np.testing.assert_allclose(noisy.runs, [0.003, 0.009])
@@ -74,14 +74,14 @@ def test_slopes_are_those_of_the_last_half(store: Store, add_forecast: Any) -> N
 def test_the_slope_is_by_least_squares(store: Store, add_forecast: Any) -> None:
     errors = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 4.0, 2.0])
     add_forecast(0, steps=8, errors={"test/mse": errors})
-    (slopes,) = fig7_noise.collect(store).panels[0].slopes
+    (slopes,) = FIGURES["fig7"].collect(store).panels[0].slopes
     # steps 5 to 8, centred -1.5 -0.5 0.5 1.5: (-1.5 - 0.5 + 0.5 * 4 + 1.5 * 2) / (2.25 + 0.25 + 0.25 + 2.25)
     np.testing.assert_allclose(slopes.runs, [3.0 / 5.0])
-    assert "ssail 0.6 (one run), constant velocity" in fig7_noise.collect(store).notes[-2]
+    assert "ssail 0.6 (one run), constant velocity" in FIGURES["fig7"].collect(store).notes[-2]
 
 
 def test_the_statistic_can_be_chosen(store: Store, runs: list[str]) -> None:
-    record = fig7_noise.collect(store, statistic=Statistic.MEDIAN_IQR)
+    record = FIGURES["fig7"].collect(store, statistic=Statistic.MEDIAN_IQR)
     (dnri,) = (shown for shown in record.panels[0].bands if shown.label == "dnri")
     np.testing.assert_allclose(dnri.summary, median_quartiles([curve.values for curve in dnri.curves]))
     assert "median" in set(record.table()["kind"])
@@ -92,7 +92,7 @@ def test_a_diverged_run_takes_the_mean_with_it_and_is_shown(
     store: Store, runs: list[str], add_forecast: Any, tmp_path: Path
 ) -> None:
     lost = add_forecast(3, method="dnri", state=RunState.DIVERGED)
-    record = fig7_noise.collect(store)
+    record = FIGURES["fig7"].collect(store)
     figure = fig7_noise.draw(record)
     for axes, panel in zip(figure.axes, record.panels, strict=True):
         ssail, dnri = panel.bands
@@ -109,7 +109,7 @@ def test_a_diverged_run_takes_the_mean_with_it_and_is_shown(
         "constant velocity",
     ]
     assert all("dnri none (1 of 4 runs without finite errors)" in note for note in record.notes[-2:])
-    median = fig7_noise.collect(store, statistic=Statistic.MEDIAN_IQR).panels[0].bands[1]
+    median = FIGURES["fig7"].collect(store, statistic=Statistic.MEDIAN_IQR).panels[0].bands[1]
     np.testing.assert_allclose(median.summary.centre[0], 1.5 * 0.007)  # of 0.004, 0.004, 0.010 and infinity
     assert (record.table()["kind"] == "diverged").sum() == 2
 
@@ -118,10 +118,10 @@ def test_predictions_that_explode_under_noise_alone(store: Store, add_forecast: 
     exploded = np.array([0.01, 0.1, np.inf, np.nan])
     run = add_forecast(0, steps=4, errors={"test_noisy/mse": exploded})
     add_forecast(1, steps=4)
-    clean, noisy = fig7_noise.collect(store).panels
+    clean, noisy = FIGURES["fig7"].collect(store).panels
     assert [panel.bands[0].diverged for panel in (clean, noisy)] == [0, 1]
     np.testing.assert_array_equal(np.isfinite(noisy.bands[0].summary.centre), [True, True, False, False])
-    figure = fig7_noise.draw(fig7_noise.collect(store))
+    figure = fig7_noise.draw(FIGURES["fig7"].collect(store))
     assert f"diverged-{run}" not in lines(figure.axes[0])
     assert lines(figure.axes[1])[f"diverged-{run}"].get_xdata()[0] == 3
     assert figure.legends[0].get_texts()[0].get_text() == "ssail: 2 runs, 1 diverged (x)"
@@ -130,7 +130,7 @@ def test_predictions_that_explode_under_noise_alone(store: Store, add_forecast: 
 @pytest.mark.parametrize("statistic", Statistic)
 def test_only_diverged_runs_can_be_drawn(store: Store, add_forecast: Any, statistic: Statistic) -> None:
     add_forecast(0, state=RunState.DIVERGED)
-    record = fig7_noise.collect(store, statistic=statistic)
+    record = FIGURES["fig7"].collect(store, statistic=statistic)
     figure = fig7_noise.draw(record)
     assert len(figure.axes) == 2
     assert list(record.table()["kind"]) == ["diverged", "run slope", "mean slope"] * 2
@@ -138,7 +138,7 @@ def test_only_diverged_runs_can_be_drawn(store: Store, add_forecast: Any, statis
 
 @pytest.mark.parametrize("statistic", Statistic)
 def test_picture_and_csv_show_the_record(store: Store, runs: list[str], tmp_path: Path, statistic: Statistic) -> None:
-    record = fig7_noise.collect(store, statistic=statistic)
+    record = FIGURES["fig7"].collect(store, statistic=statistic)
     figure = fig7_noise.draw(record)
     csv = pd.read_csv(save("noise", record, figure, tmp_path)[-1])
     for axes, (_, rows) in zip(figure.axes, csv.groupby("condition"), strict=True):
@@ -166,7 +166,7 @@ def same(line: Line2D, rows: pd.DataFrame) -> bool:
 
 
 def test_the_axes_are_named_linear_from_zero_and_free_of_the_legend(store: Store, runs: list[str]) -> None:
-    figure = fig7_noise.draw(fig7_noise.collect(store))
+    figure = fig7_noise.draw(FIGURES["fig7"].collect(store))
     assert [axes.get_title(loc="left") for axes in figure.axes] == [
         "clean input",
         "noisy input (std 0.05 scaled units)",
@@ -186,7 +186,7 @@ def test_the_axes_are_named_linear_from_zero_and_free_of_the_legend(store: Store
 
 def test_a_run_far_above_the_others_does_not_flatten_them(store: Store, runs: list[str], add_forecast: Any) -> None:
     add_forecast(3, 100.0, method="dnri", steps=STEPS)
-    record = fig7_noise.collect(store)
+    record = FIGURES["fig7"].collect(store)
     clean = record.panels[0]
     assert clean.end == pytest.approx(fig7_noise.SCALE_LIMIT * 0.007 * 4)  # the median of dnri's peaks
     assert fig7_noise.draw(record).axes[0].get_ylim()[1] == clean.end
@@ -196,7 +196,7 @@ def test_a_run_far_above_the_others_does_not_flatten_them(store: Store, runs: li
 
 def test_a_reference_far_above_the_methods_does_not_flatten_them(store: Store, runs: list[str]) -> None:
     """With noise constant velocity can be a hundred times worse; then it is told, and does not set the scale."""
-    panel = fig7_noise.collect(store).panels[1]
+    panel = FIGURES["fig7"].collect(store).panels[1]
     assert not panel.reference_leaves
     far = replace(panel, reference=1000 * panel.reference)
     assert far.reference_leaves
@@ -209,18 +209,18 @@ def test_a_reference_far_above_the_methods_does_not_flatten_them(store: Store, r
 def test_runs_that_were_tested_in_different_ways_are_not_compared(store: Store, add_forecast: Any) -> None:
     first, second = add_forecast(0), add_forecast(0, method="dnri", overrides=["forecast.noise=0.1"])
     with pytest.raises(InputError, match=rf"^runs {first[:8]} and {second[:8]} differ in forecast\.noise, so fig7 "):
-        fig7_noise.collect(store, [first, second])
+        FIGURES["fig7"].collect(store, [first, second])
     history = add_forecast(0, overrides=["forecast.noise_on=history"])
-    assert "on the observed history alone" in fig7_noise.collect(store, [history]).notes[0]
-    assert "on every state that is read" in fig7_noise.collect(store, [first]).notes[0]
+    assert "on the observed history alone" in FIGURES["fig7"].collect(store, [history]).notes[0]
+    assert "on every state that is read" in FIGURES["fig7"].collect(store, [first]).notes[0]
 
 
 def test_unfinished_and_absent_runs_are_said(store: Store, add_run: Any, add_forecast: Any) -> None:
     with pytest.raises(NoRuns, match="run `ssmail train --method ssail --env mocap --profile quick --seeds 0-4`"):
-        fig7_noise.collect(store)
+        FIGURES["fig7"].collect(store)
     other = add_run(0)
     with pytest.raises(InputError, match=r"is of yjunction, but fig7 draws mocap; leave it out\.$"):
-        fig7_noise.collect(store, [other])
+        FIGURES["fig7"].collect(store, [other])
     run = add_forecast(0, state=RunState.INTERRUPTED)
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no test errors; "):
-        fig7_noise.collect(store, [run])
+        FIGURES["fig7"].collect(store, [run])

@@ -14,7 +14,7 @@ from ssmail.config.spec import ENVIRONMENTS
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, median_quartiles
 from ssmail.paper import fig8_alpha
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 
@@ -35,14 +35,14 @@ def runs(vary_alpha: Any) -> dict[Any, list[str]]:
 def test_the_ranges_of_experiments_yaml_in_their_order(store: Store, vary_alpha: Any) -> None:
     own = ((-1.0, 0.0, 1.0), (0.0, 1.0, 3.0))
     runs = vary_alpha({own: [0.1], BOTH: [0.2], POSITIVE: [0.3]})
-    record = fig8_alpha.collect(store)
+    record = FIGURES["fig8"].collect(store)
     assert [band.label for band in record.errors] == ["[0, 1]", "[-1, 1]", "[[-1, 0, 1], [0, 1, 3]]"]
     assert ablation("alpha").values == (POSITIVE, BOTH)
     assert record.provenance.run_ids == tuple(run for value in (POSITIVE, BOTH, own) for run in runs[value])
 
 
 def test_mean_and_std_of_the_error_over_seeds(store: Store, runs: dict[Any, list[str]]) -> None:
-    record = fig8_alpha.collect(store)
+    record = FIGURES["fig8"].collect(store)
     positive, both = record.errors
     assert record.error == "train/mse"
     np.testing.assert_allclose(positive.summary.centre, [0.04, 0.02, 0.02])
@@ -52,24 +52,24 @@ def test_mean_and_std_of_the_error_over_seeds(store: Store, runs: dict[Any, list
 
 
 def test_the_loss_is_that_on_generated_and_expert_alone(store: Store, runs: dict[Any, list[str]]) -> None:
-    for band in fig8_alpha.collect(store).losses:
+    for band in FIGURES["fig8"].collect(store).losses:
         for seed, curve in enumerate(band.curves):
             np.testing.assert_allclose(curve.values, np.array([0.5, 0.3, 0.3]) + seed / 10)  # no 9 of the third term
         np.testing.assert_allclose(band.summary.centre, [0.6, 0.4, 0.4])
-    (note,) = (text for text in fig8_alpha.collect(store).notes if text.startswith("train/mse above"))
+    (note,) = (text for text in FIGURES["fig8"].collect(store).notes if text.startswith("train/mse above"))
     assert "not the self-supervised term of Eq. 3" in note
 
 
 def test_a_loss_with_an_unknown_term_is_unknown(store: Store, add_run: Any) -> None:
     terms = {"discriminator/generated": [0.3, np.nan, 0.2], "discriminator/expert": [0.1, 0.1, 0.1]}
     add_run(0, spec=ablation_specs("alpha", "smoke")[BOTH], epochs={"train/mse": [1.0, 0.5, 0.4], **terms})
-    (band,) = fig8_alpha.collect(store).losses
+    (band,) = FIGURES["fig8"].collect(store).losses
     np.testing.assert_allclose(band.curves[0].values, [0.4, np.nan, 0.3])
     assert band.diverged == 0  # a loss of the discriminator is no error
 
 
 def test_the_first_range_is_compared_with_the_others(store: Store, runs: dict[Any, list[str]]) -> None:
-    assert fig8_alpha.collect(store).notes[-1] == (
+    assert FIGURES["fig8"].collect(store).notes[-1] == (
         "[0, 1] against [-1, 1] at the last epoch: medians 0.02 and 0.002, exact two-sided permutation test on ranks "
         "p = 0.1 (least possible 0.1)."
     )
@@ -77,7 +77,7 @@ def test_the_first_range_is_compared_with_the_others(store: Store, runs: dict[An
 
 def test_a_diverged_run_is_counted_and_shown(store: Store, vary_alpha: Any) -> None:
     (_, lost), _ = vary_alpha({POSITIVE: [0.01, None], BOTH: [0.001, 0.002]}).values()
-    record = fig8_alpha.collect(store)
+    record = FIGURES["fig8"].collect(store)
     assert [band.diverged for band in record.errors] == [1, 0]
     np.testing.assert_array_equal(np.isnan(record.errors[0].summary.centre), [False, True, True])
     figure = fig8_alpha.draw(record)
@@ -98,7 +98,7 @@ def test_only_diverged_runs_and_runs_without_any_epoch_can_be_drawn(
 ) -> None:
     for spec in ablation_specs("alpha", "smoke").values():
         add_run(0, [], RunState.DIVERGED, spec=spec)
-    record = fig8_alpha.collect(store, statistic=statistic)
+    record = FIGURES["fig8"].collect(store, statistic=statistic)
     assert record.constant_velocity is None
     assert len(fig8_alpha.draw(record).axes) == 2
 
@@ -107,7 +107,7 @@ def test_only_diverged_runs_and_runs_without_any_epoch_can_be_drawn(
 def test_picture_and_csv_show_the_record(
     store: Store, runs: dict[Any, list[str]], tmp_path: Path, statistic: Statistic
 ) -> None:
-    record = fig8_alpha.collect(store, statistic=statistic)
+    record = FIGURES["fig8"].collect(store, statistic=statistic)
     figure = fig8_alpha.draw(record)
     csv = pd.read_csv(save("alpha", record, figure, tmp_path)[-1])
     for axes, metric in zip(figure.axes, ("train/mse", fig8_alpha.LOSS), strict=True):
@@ -130,7 +130,7 @@ def same(line: Line2D, rows: pd.DataFrame) -> bool:
 
 
 def test_the_axes_are_named_and_free_of_the_legend(store: Store, runs: dict[Any, list[str]]) -> None:
-    figure = fig8_alpha.draw(fig8_alpha.collect(store))
+    figure = fig8_alpha.draw(FIGURES["fig8"].collect(store))
     upper, lower = figure.axes
     assert (upper.get_yscale(), lower.get_yscale()) == ("log", "linear")
     assert upper.get_ylabel() == "training error, mse\n(squared scaled units)"
@@ -148,23 +148,23 @@ def test_another_environment_has_its_own_runs_and_error(
 ) -> None:
     assert set(fig8_alpha.ERRORS) == set(ENVIRONMENTS)
     elsewhere = vary_alpha({POSITIVE: [0.1], BOTH: [0.2]}, environment="yjunction")
-    record = fig8_alpha.collect(store, environment="yjunction")
+    record = FIGURES["fig8"].collect(store, environment="yjunction")
     assert record.error == "train/mode_mse"
     assert [band.curves[0].run_id for band in record.errors] == [run for (run,) in elsewhere.values()]
     assert record.errors[0].curves[0].values[-1] == 0.1
     assert record.constant_velocity == 0.045
     assert fig8_alpha.draw(record).axes[0].get_ylabel().startswith("training error, mode_mse")
-    assert len(fig8_alpha.collect(store).errors[0].curves) == 3  # those of mocap are still its own
+    assert len(FIGURES["fig8"].collect(store).errors[0].curves) == 3  # those of mocap are still its own
 
 
 def test_what_cannot_be_drawn_is_said(store: Store, add_run: Any) -> None:
     with pytest.raises(NoRuns, match="no run of the ablation alpha on mocap; run `ssmail ablate alpha --profile quick"):
-        fig8_alpha.collect(store)
+        FIGURES["fig8"].collect(store)
     with pytest.raises(NoRuns, match="on yjunction; run `ssmail ablate alpha --env yjunction --profile quick --seeds"):
-        fig8_alpha.collect(store, environment="yjunction")
+        FIGURES["fig8"].collect(store, environment="yjunction")
     run = add_run(0, state=RunState.INTERRUPTED, spec=ablation_specs("alpha", "smoke")[BOTH])
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no train/mse yet; "):
-        fig8_alpha.collect(store, [run])
+        FIGURES["fig8"].collect(store, [run])
     half = add_run(1, spec=ablation_specs("alpha", "smoke")[BOTH], epochs={"train/mse": [1.0, 0.5, 0.4]})
     with pytest.raises(InputError, match=rf"^run {half[:8]} \(finished\) has no discriminator/generated yet; "):
-        fig8_alpha.collect(store, [half])
+        FIGURES["fig8"].collect(store, [half])

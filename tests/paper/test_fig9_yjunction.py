@@ -9,7 +9,7 @@ import pytest
 
 from ssmail.errors import InputError
 from ssmail.paper import fig9_yjunction
-from ssmail.paper.results import save
+from ssmail.paper.results import FIGURES, save
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
 
@@ -18,7 +18,7 @@ from .handmade_arrays import AGENTS, STEPS, lanes
 
 def test_the_first_trajectory_of_each_lane_is_shown(store: Store, add_run: Any) -> None:
     run = add_run(0)
-    record = fig9_yjunction.collect(store)
+    record = FIGURES["fig9"].collect(store)
     np.testing.assert_array_equal(record.lanes, [0, 1])
     np.testing.assert_array_equal(record.trajectories, [lanes()[0, 1], lanes()[1, 0]])  # train/lane is 1, 0, 1
     np.testing.assert_array_equal(record.steps, [0, 1, 3, 4])
@@ -30,7 +30,7 @@ def test_the_first_trajectory_of_each_lane_is_shown(store: Store, add_run: Any) 
 
 def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: Path) -> None:
     add_run(0)
-    record = fig9_yjunction.collect(store)
+    record = FIGURES["fig9"].collect(store)
     figure = fig9_yjunction.draw(record)
     (axes,) = figure.axes
     csv = pd.read_csv(save("fig9", record, figure, tmp_path)[-1])
@@ -48,7 +48,7 @@ def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: P
 
 def test_a_training_set_that_uses_one_lane_still_shows_both(store: Store, add_run: Any) -> None:
     add_run(0, train__lane=np.array([1, 1, 1]))
-    record = fig9_yjunction.collect(store)
+    record = FIGURES["fig9"].collect(store)
     np.testing.assert_array_equal(record.lanes, [1])
     assert {"lane 0", "lane 1"} <= {text.get_text() for text in fig9_yjunction.draw(record).axes[0].texts}
 
@@ -56,8 +56,8 @@ def test_a_training_set_that_uses_one_lane_still_shows_both(store: Store, add_ru
 def test_the_newest_run_with_the_expert_set_is_the_source(store: Store, add_run: Any) -> None:
     first, second = add_run(0), add_run(1)
     without = add_run(2, state=RunState.DIVERGED)
-    assert fig9_yjunction.collect(store).provenance.run_ids == (second,)
-    assert fig9_yjunction.collect(store, [first, without]).provenance.run_ids == (first,)
+    assert FIGURES["fig9"].collect(store).provenance.run_ids == (second,)
+    assert FIGURES["fig9"].collect(store, [first, without]).provenance.run_ids == (first,)
 
 
 def test_a_run_without_the_expert_set_stands_for_one_on_the_same_data(store: Store, add_run: Any) -> None:
@@ -65,16 +65,16 @@ def test_a_run_without_the_expert_set_stands_for_one_on_the_same_data(store: Sto
     holds = add_run(0)
     add_run(1, dataset_hash="e" * 64)
     same, other = (add_run(2 + n, state=RunState.DIVERGED, dataset_hash=data * 64) for n, data in enumerate("df"))
-    assert fig9_yjunction.collect(store, [same]).provenance.run_ids == (holds,)
+    assert FIGURES["fig9"].collect(store, [same]).provenance.run_ids == (holds,)
     with pytest.raises(InputError, match=r"^none of the given runs holds the expert set of yjunction; "):
-        fig9_yjunction.collect(store, [other])
+        FIGURES["fig9"].collect(store, [other])
 
 
 def test_no_runs_is_one_sentence_with_the_command(store: Store, add_run: Any) -> None:
     command = "run `ssmail train --method ssail --env yjunction --profile quick --seeds 0-4`."
     with pytest.raises(NoRuns) as empty:
-        fig9_yjunction.collect(store)
+        FIGURES["fig9"].collect(store)
     assert str(empty.value) == f"fig9 has nothing to draw: {store.where} holds no run on yjunction; {command}"
     add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(NoRuns, match="holds no finished run on yjunction"):
-        fig9_yjunction.collect(store)
+        FIGURES["fig9"].collect(store)

@@ -138,7 +138,7 @@ def test_an_epoch_that_is_not_finite_is_never_the_best(toy: ToySpec, bad: float)
     kept = []
     for loop.epoch, error in enumerate([bad, 0.3, bad, 0.4, 0.2], 1):
         loop._select(*loop.evaluator.rank({"validation/mse": error}))
-        kept.append(loop.best_epoch)
+        kept.append(loop.best["epoch"])
     assert kept == [0, 2, 2, 2, 5]
 
 

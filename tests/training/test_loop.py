@@ -154,7 +154,7 @@ def test_the_best_model_uses_every_mode_if_one_does(spec: RunSpec) -> None:
         [(0.02, 0.0), (0.03, 0.0), (0.05, 0.4), (0.01, 0.1), (0.04, 0.3), (0.06, 0.5)], 1
     ):
         loop._select(*loop.evaluator.rank({"validation/mode_mse": error, "validation/lane_balance": balance}))
-        kept.append((loop.improved, loop.best_epoch))
+        kept.append((loop.improved, loop.best["epoch"]))
     assert kept == [(True, 1), (False, 1), (True, 3), (False, 3), (True, 5), (False, 5)]
     loop._select(*loop.evaluator.rank({"validation/mode_mse": math.nan, "validation/lane_balance": 0.5}))
     assert not loop.improved
@@ -168,7 +168,7 @@ def test_every_method_predicts_recorded_motion(method: str, toy: ToySpec) -> Non
         record = loop.run_epoch()
         assert {"validation/mse", "validation/mse_1", "train/mse", "seconds"} <= record.keys()
         assert all(map(math.isfinite, record.values()))
-        assert loop.best_epoch == 1
+        assert loop.best["epoch"] == 1
     values, _ = loop.final_evaluation()
     assert {"test/mse_10", "test_noisy/mse_10", "test_constant_velocity/mse_10", "test/diverged"} <= values.keys()
     assert all(map(math.isfinite, values.values()))

@@ -40,7 +40,6 @@ from ssmail.plots import landscape_grids, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
-from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig1"
@@ -125,12 +124,8 @@ class LandscapesRecord:
         return table.astype(dict.fromkeys(["seed", "epoch", "trajectory", "agent", "step"], "Int64"))
 
 
-def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> LandscapesRecord:
-    """Collect the runs that the figure draws by default, or those of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without landscapes.
-    """
-    selection = select(store, NAME, runs, profile)
+def collect(store: Store, selection: Selection) -> LandscapesRecord:
+    """Collect the landscapes of the runs. Raises InputError for a run without landscapes."""
     measured = _measured(store, selection)
     order = sorted(dict.fromkeys(item.label for item in measured), key=lambda label: label.startswith("ssail"))
     shown = [_shown(store, median_of([item for item in measured if item.label == label])) for label in order]

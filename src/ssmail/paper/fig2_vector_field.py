@@ -36,7 +36,7 @@ from ssmail.plots import landscape_grids, style
 from ssmail.plots.formatting import setting
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
-from ssmail.plots.series import figure_ablation, select
+from ssmail.plots.series import figure_ablation
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
@@ -143,13 +143,9 @@ class VectorFieldRecord:
         return table.astype(dict.fromkeys(["seed", "epoch", "trajectory", "agent", "step"], "Int64"))
 
 
-def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> VectorFieldRecord:
-    """Collect the runs that the figure draws by default, or those of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without a vector field.
-    """
-    selection = select(store, NAME, runs, profile)
-    selection = selection if runs else _of_the_paper(selection)
+def collect(store: Store, selection: Selection) -> VectorFieldRecord:
+    """Collect the vector fields of the runs. Raises InputError for a run without a vector field."""
+    selection = selection if selection.named else _of_the_paper(selection)
     measured = _measured(store, selection)
     chosen = [median_of([one for one in measured if one.label == group.label]) for group in selection.groups]
     fields = tuple(_field(store, one) for one in chosen)

@@ -10,7 +10,6 @@ lengths, because the closed form is the same for all seeds. Gradual is judged ag
 paper calls less smooth (in a passage that is commented out).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import cycle
 
@@ -27,10 +26,9 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
-from ssmail.plots.curves import Band, Curve, band, check_recorded
+from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads
-from ssmail.plots.series import select
+from ssmail.plots.run_groups import Group, Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig3"
@@ -71,23 +69,11 @@ class CurriculaRecord:
         return pd.DataFrame(rows, columns=list(curves.COLUMNS))
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> CurriculaRecord:
-    """Collect the segment lengths of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run that stored no segment lengths.
-    """
-    selection = select(store, NAME, runs, profile)
-    values = store.metrics([run.id for run in selection.runs], names=[MEASURED, EXPECTED])
-    measured, expected = (values[values["name"] == name] for name in (MEASURED, EXPECTED))
-    check_recorded(selection.groups, MEASURED, measured)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> CurriculaRecord:
+    """Collect the segment lengths of the runs. Raises InputError for a run that stored no segment lengths."""
+    expected = store.metrics([run.id for run in selection.runs], names=[EXPECTED])
     return CurriculaRecord(
-        bands=tuple(band(group, MEASURED, measured, statistic) for group in selection.groups),
+        bands=curves.bands(store, selection, [MEASURED], statistic),
         expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
         statistic=statistic,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),

@@ -29,10 +29,9 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import every_seed, median_seed, smaller
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.curves import REFERENCE, Band, band, check_recorded, constant_velocity
+from ssmail.plots.curves import REFERENCE, Band, constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Reads
-from ssmail.plots.series import select
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig4"
@@ -78,21 +77,9 @@ class StabilityRecord:
         return pd.DataFrame(rows, columns=list(curves.COLUMNS))
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> StabilityRecord:
-    """Collect the training errors of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without training errors.
-    """
-    selection = select(store, NAME, runs, profile)
-    errors = store.metrics([run.id for run in selection.runs], names=[METRIC])
-    check_recorded(selection.groups, METRIC, errors)
-    bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> StabilityRecord:
+    """Collect the training errors of the runs. Raises InputError for a run without training errors."""
+    bands = curves.bands(store, selection, [METRIC], statistic)
     return StabilityRecord(
         bands=bands,
         statistic=statistic,

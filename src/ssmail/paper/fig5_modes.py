@@ -16,7 +16,6 @@ modes apart either, so both lanes have to be used.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -29,9 +28,9 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
+from ssmail.plots.landscape_grids import draw_paths, path_rows
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection, check_settled
-from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import latest_values
 
@@ -57,6 +56,7 @@ BETWEEN_STATISTIC = (
 )
 FRAME_WIDENING = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
 LANE_WIDTH = 3.5  # points
+ORDER = ["trajectory", "agent", "step"]  # of the rows
 
 Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
 
@@ -88,7 +88,9 @@ class ModesRecord:
 
         kind: expert, rollout, or diverged (one row without a position). Steps count from 0.
         """
-        lanes = [_points(lane, kind="expert", lane=index) for index, lane in enumerate(self.expert)]
+        lanes = [
+            path_rows(lane, kind="expert", lane=index).sort_values(ORDER) for index, lane in enumerate(self.expert)
+        ]
         table = pd.concat([*lanes, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
         order = ["kind", "label", "run_id", "seed", "on_lane", "lane_balance", "lane"]
         table = table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
@@ -104,16 +106,13 @@ class ModesRecord:
         return int((~inside).any(axis=(1, 2)).sum())
 
 
-def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> ModesRecord:
-    """Collect the test rollouts of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test rollouts.
-    """
-    selection = select(store, NAME, runs, profile)
+def collect(store: Store, selection: Selection) -> ModesRecord:
+    """Collect the test rollouts of the runs. Raises InputError for a run without test rollouts."""
     check_settled(selection.runs, "test rollouts")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = shown_lanes(store.array(finished[0].id, LANES)) if finished else np.empty((0, 0, 0, 0, 2))
-    panels = _panels(store, selection)
+    values = latest_values(store, selection.runs, [ON_LANE, LANE_BALANCE])
+    panels = tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
     return ModesRecord(
         panels=panels,
         expert=expert,
@@ -155,11 +154,6 @@ def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
     return (float(low[0] - margin), float(high[0] + margin), float(low[1] - margin), float(high[1] + margin))
 
 
-def _panels(store: Store, selection: Selection) -> tuple[Panel, ...]:
-    values = latest_values(store, selection.runs, [ON_LANE, LANE_BALANCE])
-    return tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
-
-
 def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
         return Panel(label, run.id, run.seed, None, np.nan, np.nan)
@@ -167,20 +161,12 @@ def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str
     return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
 
 
-def _points(trajectories: Floats, **columns: object) -> pd.DataFrame:
-    """Rows of trajectory, agent, step, x, y for (R, T, N, 2) positions, after the constant `columns`."""
-    trajectory, step, agent = (index.ravel() for index in np.indices(trajectories.shape[:-1]))
-    x, y = trajectories.reshape(-1, 2).T
-    rows = {"trajectory": trajectory, "agent": agent, "step": step, "x": x, "y": y}
-    return pd.DataFrame({**columns, **rows}).sort_values(["trajectory", "agent", "step"])
-
-
 def _panel_rows(panel: Panel) -> pd.DataFrame:
     run = {"label": panel.label, "run_id": panel.run_id, "seed": panel.seed}
     if panel.rollouts is None:
         return pd.DataFrame([{"kind": "diverged", **run}])
     shares = {"on_lane": panel.on_lane, "lane_balance": panel.lane_balance}
-    return _points(panel.rollouts, kind="rollout", **run, **shares)
+    return path_rows(panel.rollouts, kind="rollout", **run, **shares).sort_values(ORDER)
 
 
 def share_between(rollouts: Floats, lanes: Floats) -> float:
@@ -263,11 +249,11 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
     axes.set(xlim=record.frame[:2], ylim=record.frame[2:])
     axes.grid(False)
     for lane in record.expert:
-        _draw_paths(axes, lane, color=style.LANE, lw=LANE_WIDTH)
+        draw_paths(axes, lane, style.LANE, lw=LANE_WIDTH)
     if panel.rollouts is None:
         words = ["diverged:", "no test rollouts"]
     else:
-        _draw_paths(axes, panel.rollouts, color=colour, lw=0.4, alpha=0.8)
+        draw_paths(axes, panel.rollouts, colour, lw=0.4, alpha=0.8)
         ends = panel.rollouts[:, -1].reshape(-1, 2)
         axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
         words = [f"{100 * panel.on_lane:.0f} % on lane", f"rarer lane {100 * panel.lane_balance:.0f} %"]
@@ -275,9 +261,3 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
             words.append(f"{outside} of {len(panel.rollouts)} cut off")
     axes.text(0.03, 0.97, title, transform=axes.transAxes, va="top", fontsize=7, weight="bold")
     axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=6)
-
-
-def _draw_paths(axes: Axes, trajectories: Floats, **line: Any) -> None:
-    """Draw one line for each agent of each trajectory (R, T, N, 2)."""
-    for trajectory in trajectories:
-        axes.plot(trajectory[..., 0], trajectory[..., 1], solid_capstyle="round", **line)

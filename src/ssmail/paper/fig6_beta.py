@@ -15,6 +15,7 @@ value 0.15 is the paper's and was fixed beforehand, because the best of several 
 "Considerably" is left out: any difference counts that cannot be chance.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -32,8 +33,8 @@ from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import style
 from ssmail.plots.curves import constant_velocity
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads, check_settled
-from ssmail.plots.series import figure_ablation, select
+from ssmail.plots.run_groups import Group, Reads, Selection, check_settled
+from ssmail.plots.series import figure_ablation
 from ssmail.store import Store
 
 NAME = "fig6"
@@ -103,19 +104,9 @@ class BetaRecord:
         return pd.DataFrame(rows, columns=["kind", "beta", "run_id", "seed", *measured])
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> BetaRecord:
-    """Collect the test results of the runs that the figure draws by default, or of the given ids.
-
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without test results.
-    """
+def collect(store: Store, selection: Selection, statistic: Statistic) -> BetaRecord:
+    """Collect the test results of the runs. Raises InputError for a run without test results."""
     figure_ablation(NAME)  # without one there are no values for the axis
-    selection = select(store, NAME, runs, profile)
     check_settled(selection.runs, "test error")
     columns = tuple(_column(Runs(store, selection), group, statistic) for group in selection.groups)
     return BetaRecord(
@@ -177,7 +168,8 @@ def draw(record: BetaRecord) -> Figure:
         upper.set_ylabel("test error, mode_mse\n(squared scaled units)")
         lower.set_ylim(-0.02, 0.52)
         lower.set_ylabel("lane_balance\n(share)")
-        lower.set_xticks(range(len(record.columns)), [_short(column.label) for column in record.columns])
+        labels = [re.sub(r"^0\.", ".", column.label) for column in record.columns]  # to fit beside their neighbours
+        lower.set_xticks(range(len(record.columns)), labels)
         lower.set_xlabel("β (fraction of the epochs, evenly spaced values)")
         for axes in (upper, lower):
             axes.grid(False, axis="x")
@@ -187,11 +179,6 @@ def draw(record: BetaRecord) -> Figure:
             handles.append(style.draw_reference(upper, record.constant_velocity))
         figure.legend(handles=handles, loc="outside upper center", ncols=2)
         return figure
-
-
-def _short(label: str) -> str:
-    """Shorten "0.05" to ".05", to fit beside its neighbours."""
-    return label.removeprefix("0") if label.startswith("0.") else label
 
 
 def _places(index: int, count: int) -> Floats:
@@ -209,8 +196,8 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
             top = np.full(column.diverged, axes.get_ylim()[1])
             style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(f"diverged-{column.label}")
     lowest = np.array([np.fmin.reduce(column.error) for column in record.columns])
-    summary = _over_columns([column.error_summary for column in record.columns])
-    line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
+    centre, low, high = np.array([column.error_summary for column in record.columns]).T
+    line = _draw_centres(axes, Summary(centre, style.cut_low(low, lowest), high))
     line.set_label(record.statistic.words)
     handles = [Line2D([], [], color=POINTS, marker=".", ls="", ms=5, mew=0, label="one run"), line]
     if diverged := sum(column.diverged for column in record.columns):
@@ -224,12 +211,7 @@ def _draw_balances(axes: Axes, record: BetaRecord) -> None:
     for index, column in enumerate(record.columns):
         x = _places(index, len(column.balance))
         axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
-    _draw_centres(axes, _over_columns([column.balance_summary for column in record.columns]))
-
-
-def _over_columns(summaries: Sequence[Summary]) -> Summary:
-    """Stack the summaries of C columns into one of three (C,) arrays."""
-    return Summary(*(np.array(part) for part in zip(*summaries, strict=True)))
+    _draw_centres(axes, Summary(*np.array([column.balance_summary for column in record.columns]).T))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:

@@ -45,7 +45,6 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, Curve, band
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection, check_settled
-from ssmail.plots.series import select
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "fig7"
@@ -155,19 +154,11 @@ class NoiseRecord:
         return pd.DataFrame(rows, columns=["condition", *columns])
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-) -> NoiseRecord:
-    """Collect the test errors of the runs that the figure draws by default, or of the given ids.
+def collect(store: Store, selection: Selection, statistic: Statistic) -> NoiseRecord:
+    """Collect the test errors of the runs.
 
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id, a run without test errors, and runs that
-    were tested in different ways.
+    Raises InputError for a run without test errors, and for runs that were tested in different ways.
     """
-    selection = select(store, NAME, runs, profile)
     forecast = _forecast(selection.runs)
     panels = tuple(_panel(store, selection, condition, statistic) for condition in CONDITIONS)
     what = "every state that is read" if forecast["noise_on"] == "all" else "the observed history alone"

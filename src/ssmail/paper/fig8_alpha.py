@@ -35,12 +35,11 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import smaller
 from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.curves import Band, band, check_recorded, constant_velocity
+from ssmail.plots.curves import Band, constant_velocity
 from ssmail.plots.formatting import setting
 from ssmail.plots.metric_units import last_part
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
-from ssmail.plots.series import select
 from ssmail.store import Store
 
 NAME = "fig8"
@@ -86,24 +85,12 @@ class AlphaRecord:
         return pd.DataFrame(rows, columns=["metric", *curves.COLUMNS])
 
 
-def collect(
-    store: Store,
-    runs: Sequence[str] | None = None,
-    *,
-    profile: str | None = None,
-    statistic: Statistic = Statistic.MEAN_STD,
-    environment: str | None = None,
-) -> AlphaRecord:
-    """Collect the runs that the figure draws by default, or those of the given ids.
-
-    `environment` is that of the ablation by default.
-    Raises NoRuns when there is nothing to draw, InputError for an unfit id or a run without these metrics.
-    """
-    selection = select(store, NAME, runs, profile, environment)
+def collect(store: Store, selection: Selection, statistic: Statistic) -> AlphaRecord:
+    """Collect the policy's errors and D's losses of the runs. Raises InputError for a run without these metrics."""
     kind = ERRORS[selection.runs[0].environment]
     error = f"train/{kind}"
-    errors = _bands(store, selection, error, [error], statistic)
-    losses = _bands(store, selection, LOSS, TERMS, statistic)
+    errors = curves.bands(store, selection, [error], statistic)
+    losses = curves.bands(store, selection, TERMS, statistic, LOSS)
     which = f"{error} above, {LOSS} below: not the self-supervised term of Eq. 3, whose labels depend on the range."
     return AlphaRecord(
         error=error,
@@ -114,18 +101,6 @@ def collect(
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, which, *curve_notes.of_errors(errors)),
     )
-
-
-def _bands(
-    store: Store, selection: Selection, name: str, metrics: Sequence[str], statistic: Statistic
-) -> tuple[Band, ...]:
-    """The bands of the sum of the metrics at each epoch; unknown where one of them is."""
-    values = store.metrics([run.id for run in selection.runs], names=metrics)
-    for metric in metrics:
-        check_recorded(selection.groups, metric, values[values["name"] == metric])
-    wide = values.pivot(index=["run_id", "step"], columns="name", values="value")
-    summed = wide.sum(axis="columns", skipna=False).rename("value").reset_index()
-    return tuple(band(group, name, summed, statistic) for group in selection.groups)
 
 
 def common_level(finals: Sequence[float]) -> float:

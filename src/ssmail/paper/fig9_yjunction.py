@@ -6,7 +6,6 @@ twice as wide as the expert set strays from the centre lines. Any stored Y-Junct
 method; by default it is the newest one that holds the expert set.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,14 +13,11 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ssmail.config.experiments import figure_requirements
 from ssmail.data.trajectories import Floats, Integers
-from ssmail.errors import InputError
-from ssmail.plots import NoRuns, style
+from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Reads
-from ssmail.plots.series import train_command
-from ssmail.store import RunRow, Store
+from ssmail.plots.run_groups import Reads, Selection
+from ssmail.store import Store
 
 NAME = "fig9"
 ARRAYS = ("train/expert", "train/lane", "lane_centres")
@@ -54,14 +50,9 @@ class YJunctionRecord:
         return pd.DataFrame(rows, columns=["kind", "lane", "agent", "step", "x", "y"])
 
 
-def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | None = None) -> YJunctionRecord:
-    """Collect the environment from the newest run that holds it.
-
-    With ids, that is the newest of these runs, or else of the runs on the same data, because a compact database keeps
-    the expert set only once.
-    Raises NoRuns when no run of the environment holds its expert set, InputError for an unfit id.
-    """
-    run, notes = _source(store, runs, profile)
+def collect(store: Store, selection: Selection) -> YJunctionRecord:
+    """Collect the environment from the run."""
+    (run,) = selection.runs
     expert, lane, centre_lines = (store.array(run.id, name) for name in ARRAYS)
     used, first = np.unique(lane, return_index=True)
     return YJunctionRecord(
@@ -72,31 +63,8 @@ def collect(store: Store, runs: Sequence[str] | None = None, *, profile: str | N
         half_width=2 * max(_strays(expert[lane == index], centre_lines[index]) for index in used),
         fork=_fork(centre_lines),
         provenance=Provenance.of(NAME, [run]),
-        notes=notes,
+        notes=selection.notes,
     )
-
-
-def _source(store: Store, ids: Sequence[str] | None, profile: str | None) -> tuple[RunRow, tuple[str, ...]]:
-    needed = figure_requirements(NAME)
-    environment = needed.environment
-    stored = store.runs(ids=ids) if ids else store.runs(environment=environment, profile=profile)
-    fitting = _holding(store, stored, environment)
-    if not fitting and ids:
-        data = {run.dataset_hash for run in stored if run.environment == environment and run.dataset_hash}
-        others = [run for run in store.runs(environment=environment) if run.dataset_hash in data]
-        fitting = _holding(store, others, environment)
-    if fitting:
-        return fitting[-1], (f"the environment is that of run {fitting[-1].name}.",)
-    remedy = f"run {train_command(needed.methods[0], environment, profile)}"
-    if ids:
-        raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
-    found = "no finished run" if stored else "no run"
-    raise NoRuns(f"{NAME} has nothing to draw: {store.where} holds {found} on {environment}; {remedy}.")
-
-
-def _holding(store: Store, runs: Sequence[RunRow], environment: str) -> list[RunRow]:
-    """The runs that hold the environment's expert set."""
-    return [run for run in runs if run.environment == environment and set(ARRAYS) <= set(store.array_names(run.id))]
 
 
 def _strays(trajectories: Floats, line: Floats) -> float:

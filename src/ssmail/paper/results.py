@@ -1,9 +1,9 @@
 """The nine figures of the paper and the eight claims that are read off them.
 
-Each figure has a module. Its `collect(store)` returns a frozen record of what is shown, and `draw(record)` a matplotlib
-Figure. Where a claim is read off the figure, the module also has the CLAIM, `samples(runs)`, which reads its numbers
-from the store, and `decide(*samples)`, which tests them. Importing this table imports neither matplotlib nor pandas: a
-figure's module is imported when it is used.
+Each figure has a module. Its `collect(store, selection)` returns a frozen record of what is shown, and `draw(record)` a
+matplotlib Figure. Where a claim is read off the figure, the module also has the CLAIM, `samples(runs)`, which reads its
+numbers from the store, and `decide(*samples)`, which tests them. Importing this table imports neither matplotlib nor
+pandas: a figure's module is imported when it is used.
 """
 
 import importlib
@@ -33,6 +33,7 @@ class FigureModule:
     summary: str
     has_statistic: bool = False  # whether its centre and spread can be chosen
     has_environment: bool = False  # whether it can be drawn for another environment
+    of_data: bool = False  # whether it draws the expert set, which any run may hold, and no runs
 
     @property
     def stem(self) -> str:
@@ -54,12 +55,17 @@ class FigureModule:
         (mean-std by default) and `environment` (the paper's by default) have no effect on figures without that option.
         Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
         """
-        options: dict[str, Any] = {}
-        if self.has_statistic and statistic is not None:
-            options["statistic"] = statistic
-        if self.has_environment and environment is not None:
-            options["environment"] = environment
-        return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
+        from ssmail.evaluation.statistics import Statistic
+        from ssmail.plots.series import select, select_data
+
+        module = self._module()
+        if self.of_data:
+            return cast(
+                FigureRecord, module.collect(store, select_data(store, self.name, {*self.reads.arrays}, runs, profile))
+            )
+        selection = select(store, self.name, runs, profile, environment if self.has_environment else None)
+        options = [statistic or Statistic.MEAN_STD] if self.has_statistic else []
+        return cast(FigureRecord, module.collect(store, selection, *options))
 
     def draw(self, record: FigureRecord) -> "Figure":
         """Draw the record as a matplotlib Figure, one column wide."""
@@ -95,7 +101,7 @@ _MODULES = (
     FigureModule(
         "fig8", "alpha", "mocap: training over epochs for ranges of alpha", has_statistic=True, has_environment=True
     ),
-    FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment"),
+    FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment", of_data=True),
 )
 
 FIGURES: dict[str, FigureModule] = {key: module for module in _MODULES for key in (module.name, module.alias)}

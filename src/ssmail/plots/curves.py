@@ -23,7 +23,7 @@ from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.plots import style
 from ssmail.plots.formatting import counted
 from ssmail.plots.metric_units import is_error
-from ssmail.plots.run_groups import Group
+from ssmail.plots.run_groups import Group, Selection
 from ssmail.store import RunRow, RunState, Store
 
 CEILING = DIVERGED**2  # squared scaled units: where a scale of errors ends
@@ -124,17 +124,26 @@ def band(
     return Band(group.label, curves, epochs, summarise(table, statistic), upwards=error)
 
 
-def silent(group: Group, values: pd.DataFrame) -> list[RunRow]:
+def bands(
+    store: Store, selection: Selection, metrics: Sequence[str], statistic: Statistic, name: str = ""
+) -> tuple[Band, ...]:
+    """Make the bands of a metric that all runs recorded, or of the sum of several, which is called `name`.
+
+    The sum is unknown at an epoch where a metric is. Raises InputError for a run that lacks one, unless it diverged.
+    """
+    values = store.metrics([run.id for run in selection.runs], names=metrics)
+    for metric in metrics:
+        for run in silent(selection.runs, values[values["name"] == metric]):
+            raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
+    wide = values.pivot(index=["run_id", "step"], columns="name", values="value")
+    summed = wide.sum(axis="columns", skipna=False).rename("value").reset_index()
+    return tuple(band(group, name or metrics[0], summed, statistic) for group in selection.groups)
+
+
+def silent(runs: Sequence[RunRow], values: pd.DataFrame) -> list[RunRow]:
     """Return the runs without a value that have not diverged; nothing can be drawn of them."""
     there = set(values["run_id"])
-    return [run for run in group.runs if run.id not in there and run.state is not RunState.DIVERGED]
-
-
-def check_recorded(groups: Sequence[Group], metric: str, values: pd.DataFrame) -> None:
-    """Raise InputError for a run that recorded no value of the metric, unless it diverged."""
-    for group in groups:
-        for run in silent(group, values):
-            raise InputError(f"run {run.name} ({run.state}) has no {metric} yet; leave it out or train it further.")
+    return [run for run in runs if run.id not in there and run.state is not RunState.DIVERGED]
 
 
 def _curve(run: RunRow, values: pd.DataFrame, reached: int, error: bool) -> Curve:

@@ -33,6 +33,7 @@ class Selection:
 
     groups: tuple[Group, ...]
     notes: tuple[str, ...]
+    named: bool = False  # whether the caller named the runs
 
     @property
     def runs(self) -> tuple[RunRow, ...]:

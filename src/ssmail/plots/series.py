@@ -13,7 +13,7 @@ Explicit run ids replace this choice: all of these runs are drawn, whatever thei
 apart as groups of their own; the runs of an ablation have to make one family.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from datetime import datetime
 from typing import Any, NamedTuple
 
@@ -145,6 +145,37 @@ def select(
     return chosen
 
 
+def select_data(
+    store: Store, figure: str, arrays: Set[str], ids: Sequence[str] | None, profile: str | None
+) -> Selection:
+    """Return the newest run that holds all of these arrays of the figure's environment, whatever its method.
+
+    With `ids`, that is the newest of these runs, or else of the runs on the same data, because a compact database keeps
+    the expert set only once. Raises NoRuns when no run holds the arrays, InputError for an unfit id.
+    """
+    needed = figure_requirements(figure)
+    environment = needed.environment
+    stored = store.runs(ids=ids) if ids else store.runs(environment=environment, profile=profile)
+
+    def holding(runs: Sequence[RunRow]) -> list[RunRow]:
+        return [run for run in runs if run.environment == environment and arrays <= {*store.array_names(run.id)}]
+
+    fitting = holding(stored)
+    if not fitting and ids:
+        data = {run.dataset_hash for run in stored if run.environment == environment and run.dataset_hash}
+        fitting = holding([run for run in store.runs(environment=environment) if run.dataset_hash in data])
+    if fitting:
+        run = fitting[-1]
+        return Selection(
+            (Group(run.method, (run,)),), (f"the environment is that of run {run.name}.",), named=bool(ids)
+        )
+    remedy = f"run {train_command(needed.methods[0], environment, profile)}"
+    if ids:
+        raise InputError(f"none of the given runs holds the expert set of {environment}; leave --runs out or {remedy}.")
+    found = "no finished run" if stored else "no run"
+    raise NoRuns(f"{figure} has nothing to draw: {store.where} holds {found} on {environment}; {remedy}.")
+
+
 def figure_ablation(figure: str) -> Ablation:
     """Return the ablation whose values `figure` compares. Raises InputError when experiments.yaml names none for it."""
     found = _Comparison.of(figure).ablation
@@ -167,7 +198,7 @@ def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
             )
     if needed.ablation is not None:
         _check_one_family(needed.figure, needed.ablation.key, runs)
-        return Selection(_groups_of_values(needed.ablation, runs, tuple), ())
+        return Selection(_groups_of_values(needed.ablation, runs, tuple), (), named=True)
     places = {method: place for place, method in enumerate(needed.methods)}
     specs = sorted(by_spec(runs), key=lambda found: places.get(found[0].method, len(places)))
     methods = [found[0].method for found in specs]
@@ -176,7 +207,7 @@ def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
         method = found[0].method
         label = method if methods.count(method) == 1 else f"{method} {found[0].spec_hash[:8]}"
         groups.append(Group(label, tuple(sorted(found, key=lambda run: run.seed))))
-    return Selection(tuple(groups), ())
+    return Selection(tuple(groups), (), named=True)
 
 
 def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:

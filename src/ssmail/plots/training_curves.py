@@ -132,7 +132,7 @@ def _unknown_metric(store: Store, runs: Sequence[RunRow], metric: str) -> InputE
 
 def _groups(runs: Sequence[RunRow], values: pd.DataFrame, group_by: str) -> tuple[list[Group], list[str]]:
     """The groups by rising value, each of one spec; and what was left out."""
-    without = silent(Group("", tuple(runs)), values)
+    without = silent(runs, values)
     there = [run for run in runs if run not in without]
     keys = {run.id: _keys(run) for run in runs}
     if not any(group_by in known for known in keys.values()):

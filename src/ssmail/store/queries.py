@@ -56,6 +56,11 @@ class RunRow:
         return self.id[:8]
 
     @property
+    def cell(self) -> tuple[str, int, str | None]:
+        """What the run computes: the hash of its spec, its seed and the hash of its data."""
+        return self.spec_hash, self.seed, self.dataset_hash
+
+    @property
     def code(self) -> str:
         """The code that computed the run: "0.1.0+COMMIT", with "-dirty" where the tree was changed."""
         commit = f"+{self.git_commit}" if self.git_commit else ""

@@ -2,12 +2,14 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Unpack
 
 import torch
 from torch import Tensor, nn
 
 from ssmail.envs.integrator import Integrator
 from ssmail.training.checkpoint import Stateful
+from ssmail.training.learner import Reading
 
 
 class Baseline:
@@ -22,17 +24,9 @@ class ConstantVelocity(Baseline):
 
     integrator: Integrator
 
-    def free_run(
-        self,
-        observed: Tensor,
-        steps: int,
-        generator: torch.Generator,
-        *,
-        deterministic: bool = False,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor."""
-        states, first = [observed[:, -1]], observed.shape[1] - 1
+        states, first, noise = [observed[:, -1]], observed.shape[1] - 1, reading.get("noise")
         for t in range(steps):
             read = states[-1] if noise is None else states[-1] + noise[:, first + t]
             states.append(self._next(states[-1], read))
@@ -50,17 +44,9 @@ class ConstantVelocity(Baseline):
 class CopyLast(Baseline):
     """Every predicted state, velocities included, is a copy of the last observed state as it was read."""
 
-    def free_run(
-        self,
-        observed: Tensor,
-        steps: int,
-        generator: torch.Generator,
-        *,
-        deterministic: bool = False,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor."""
-        last, first = observed[:, -1:], observed.shape[1] - 1
+        last, first, noise = observed[:, -1:], observed.shape[1] - 1, reading.get("noise")
         copies = last.repeat(1, steps, 1, 1)
         return torch.cat([last, copies if noise is None else copies + noise[:, first : first + 1]], dim=1)
 

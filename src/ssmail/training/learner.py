@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypedDict, Unpack
 
 import torch
 from torch import Tensor, nn
@@ -34,6 +34,16 @@ class LearnerContext:
         return self.experts.actions.shape[1]
 
 
+class Reading(TypedDict, total=False):
+    """How a predictor reads and acts in `Predictor.free_run`; by default it samples, without noise.
+
+    deterministic: replace sampled actions by their means. noise: (B, H + steps - 1, N, D), added to every state read.
+    """
+
+    deterministic: bool
+    noise: Tensor | None
+
+
 class Predictor(Protocol):
     """Predicts trajectories in scaled units with its model's current weights."""
 
@@ -42,19 +52,10 @@ class Predictor(Protocol):
         """The network whose weights the loop keeps for the best epoch."""
         ...
 
-    def free_run(
-        self,
-        observed: Tensor,
-        steps: int,
-        generator: torch.Generator,
-        *,
-        deterministic: bool = False,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """Predict `steps` states from the `observed` ones (B, H, N, D), feeding each prediction back as input.
 
-        Returns (B, steps + 1, N, D): the last observed state and the predictions. `noise` (B, H + steps - 1, N, D) is
-        added to every state that the predictor reads. `deterministic` replaces sampled actions by their means.
+        Returns (B, steps + 1, N, D): the last observed state and the predictions.
         """
         ...
 

@@ -72,10 +72,7 @@ class TrainingLoop:
         self.evaluator = make_evaluator(context, self.data)
         self.epoch = 0
         self.improved = False
-        self.best_flawed = True
-        self.best_error = math.inf
-        self.best_epoch = 0
-        self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
+        self.best = self._as_best(True, math.inf)
         self.untrained = deepcopy(self.learner.predictor)
         self.landscapes = LandscapeRecorder.for_learner(context, self.learner)
         self.snapshot: Arrays = {}
@@ -108,28 +105,26 @@ class TrainingLoop:
 
     def _select(self, flawed: bool, error: float) -> None:
         """Keep this epoch's weights if the evaluator ranks it best so far."""
-        self.improved = (flawed, error) < (self.best_flawed, self.best_error)
+        self.improved = (flawed, error) < (self.best["flawed"], self.best["error"])
         if self.improved:
-            self.best_flawed, self.best_error, self.best_epoch = flawed, error, self.epoch
-            self.best_weights = deepcopy(self.learner.predictor.model.state_dict())
+            self.best = self._as_best(flawed, error)
+
+    def _as_best(self, flawed: bool, error: float) -> dict[str, Any]:
+        weights = deepcopy(self.learner.predictor.model.state_dict())
+        return {"flawed": flawed, "error": error, "epoch": self.epoch, "weights": weights}
 
     def final_evaluation(self) -> tuple[dict[str, float], Arrays]:
         """Return the metrics of the best and the last model on the test split, and the arrays to draw."""
         best = deepcopy(self.learner.predictor)
-        best.model.load_state_dict(self.best_weights)
+        best.model.load_state_dict(self.best["weights"])
         values, arrays = self.evaluator.final(best, self.learner.predictor, self.untrained)
-        return {"best_epoch": float(self.best_epoch), **values}, arrays
+        return {"best_epoch": float(self.best["epoch"]), **values}, arrays
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything needed to continue as if never interrupted, as tensors and plain data."""
         return {
             "epoch": self.epoch,
-            "best": {
-                "flawed": self.best_flawed,
-                "error": self.best_error,
-                "epoch": self.best_epoch,
-                "weights": self.best_weights,
-            },
+            "best": self.best,
             "learner": {name: part.state_dict() for name, part in self.learner.parts().items()},
             "generators": self.generators.state_dict(),
         }
@@ -139,14 +134,14 @@ class TrainingLoop:
 
         Raises UnfitState when the state is not one of such a loop; some of it may be loaded by then.
         """
-        parts, best = self.learner.parts(), fitted(state.get("best"), self.state_dict()["best"], "best")
-        if state.keys() != self.state_dict().keys() or not isinstance(state["learner"], dict):
+        own, parts = self.state_dict(), self.learner.parts()
+        if state.keys() != own.keys() or not isinstance(state["learner"], dict):
             raise UnfitState("it has other entries")
         if state["learner"].keys() != parts.keys():
             raise UnfitState("learner has other entries")
         self.epoch, self.snapshot = fitted_number(state["epoch"], 0, self.spec.epochs, "epoch"), {}
-        self.best_flawed, self.best_error, self.best_weights = best["flawed"], best["error"], best["weights"]
-        self.best_epoch = fitted_number(best["epoch"], 0, self.epoch, "best.epoch")
+        self.best = fitted(state["best"], own["best"], "best")
+        fitted_number(self.best["epoch"], 0, self.epoch, "best.epoch")
         for name, part in parts.items():
             load_part(part, state["learner"][name], f"learner.{name}")
         self.generators.load_state_dict(state["generators"])
@@ -155,7 +150,7 @@ class TrainingLoop:
 
     def best_state_dict(self) -> dict[str, Any]:
         """Return the weights with the best validation error so far, with their epoch and error."""
-        return {"epoch": self.best_epoch, "error": self.best_error, "policy": self.best_weights}
+        return {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
 
     def _check_finite(self) -> None:
         if not self._is_finite():

@@ -1,6 +1,7 @@
 """Rollouts of a graph policy in the trajectory environment."""
 
 from dataclasses import dataclass
+from typing import Unpack
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from ssmail.models.graph_encoder import Memory
 from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
+from ssmail.training.learner import Reading
 
 ENCODER_CHUNK = 10  # observed steps read at once; on recorded motion the edges of all steps together take gigabytes
 
@@ -99,17 +101,9 @@ class PolicyPredictor:
             state = self.integrator.step(state, action)
         return Rollout(torch.cat([*states, state], dim=1), torch.cat(actions, dim=1))
 
-    def free_run(
-        self,
-        observed: Tensor,
-        steps: int,
-        generator: torch.Generator,
-        *,
-        deterministic: bool = False,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor."""
-        return self.rollout(observed, steps, generator, deterministic=deterministic, noise=noise).states
+        return self.rollout(observed, steps, generator, **reading).states
 
     @torch.no_grad()
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:

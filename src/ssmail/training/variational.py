@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from typing import Unpack
 
 import torch
 from torch import Tensor, nn
@@ -20,7 +21,7 @@ from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
 from ssmail.training.cloning import SupervisedLearner
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
-from ssmail.training.learner import LearnerContext
+from ssmail.training.learner import LearnerContext, Reading
 from ssmail.training.optimization import add_noise, mean_metrics
 
 PREDICTION_CHUNK = 16  # trajectories predicted at once
@@ -125,15 +126,7 @@ class VariationalPredictor:
     integrator: Integrator
 
     @torch.no_grad()
-    def free_run(
-        self,
-        observed: Tensor,
-        steps: int,
-        generator: torch.Generator,
-        *,
-        deterministic: bool = False,
-        noise: Tensor | None = None,
-    ) -> Tensor:
+    def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor.
 
         dnri draws its graphs from the prior, nri its single graph from the posterior given the observed states. A
@@ -141,8 +134,11 @@ class VariationalPredictor:
         """
         with evaluation_mode(self.model):
             b, h, n, _ = observed.shape
+            noise = reading.get("noise")
             noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
-            gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (not deterministic)
+            gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (
+                not reading.get("deterministic")
+            )
             return in_chunks(partial(self._free_run, steps), observed, noise.expand(b, -1, -1, -1), gumbel)
 
     def _free_run(self, steps: int, observed: Tensor, noise: Tensor, gumbel: Tensor) -> Tensor:

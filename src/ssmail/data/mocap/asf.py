@@ -4,8 +4,8 @@ An .asf file (format 1.10 by Acclaim, 1995, and CMU's notes on it) describes a r
 begin where their parent ends, and the hierarchy. Directions and local axes are those of the rest pose, in global
 coordinates. Every error is one sentence that names the file and the line.
 
-The limits of the joints (motions are recorded within them) and the length unit (by custom, positions stay in the file's
-own units) are parsed but not applied. Unknown sections and entries are skipped.
+The length unit is parsed but not applied: by custom, positions stay in the file's own units. The limits of the joints
+are skipped (motions are recorded within them), as are unknown sections and entries.
 
 `parse_skeleton` works in three steps: split the file into its sections; parse the units, the root and the bones;
 connect the bones through the hierarchy.
@@ -23,7 +23,7 @@ CHANNELS = ("tx", "ty", "tz", "rx", "ry", "rz")
 ORDERS = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx")
 MOST_BONES = 1000
 _WHITE = str.maketrans("(),", "   ")
-_INFINITE = {"inf": math.inf, "+inf": math.inf, "-inf": -math.inf}  # allowed as limits
+_INFINITE = ("inf", "+inf", "-inf")  # allowed as limits
 
 Vector = tuple[float, float, float]
 
@@ -48,8 +48,7 @@ class Bone:
 
     direction: global unit vector, up to the rounding of the file. length: in file units. axis: orientation of the local
     axes, radians about the global x, y, z, applied in the order `axis_order`, which is also the order of the joint's
-    own rotations. dof: the rotations of the joint, in the order of their numbers in a frame. limits: (low, high) in
-    radians for each dof, or empty.
+    own rotations. dof: the rotations of the joint, in the order of their numbers in a frame.
     """
 
     name: str
@@ -58,7 +57,6 @@ class Bone:
     axis: Vector
     axis_order: str
     dof: tuple[str, ...]
-    limits: tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -188,7 +186,7 @@ def _bones(section: Sequence[Line], scale: float) -> dict[str, tuple[Bone, Line]
 def _blocks(lines: Iterable[Line]) -> Iterator[tuple[Line, dict[str, Line]]]:
     """Yield the line of each `begin` and the entries up to its `end`.
 
-    Lines that begin with a number continue the entry `limits`.
+    Lines that begin with a number continue the entry `limits` and are skipped with it.
     """
     begin: Line | None = None
     entries: dict[str, Line] = {}
@@ -205,10 +203,7 @@ def _blocks(lines: Iterable[Line]) -> Iterator[tuple[Line, dict[str, Line]]]:
             yield begin, entries
             begin = None
         elif last == "limits" and (key in _INFINITE or key.lstrip("+-")[:1] in tuple(".0123456789")):
-            first = entries[last]
-            if len(first.words) > 2 * len(CHANNELS):
-                raise line.fault("there are more limits than a bone can have")
-            entries[last] = Line(first.file, first.number, [*first.words, *line.words])
+            continue
         else:
             last = _enter(entries, line)
     if begin is not None:
@@ -240,19 +235,7 @@ def _bone(name: str, begin: Line, entries: Mapping[str, Line], scale: float) -> 
     axis_order = _order(line, line.words[4:])
     dof = entries.get("dof")
     rotations = _channels(dof, dof.words[1:], CHANNELS[3:], f"bone {quoted(name)}") if dof else ()
-    limits = _limits(entries["limits"], len(rotations), scale) if "limits" in entries else ()
-    return Bone(name, direction, length, axis, axis_order, rotations, limits)
-
-
-def _limits(line: Line, count: int, scale: float) -> tuple[tuple[float, float], ...]:
-    words = line.words[1:]
-    if len(words) != 2 * count:
-        raise line.fault(f"limits has {len(words)} numbers for {count} dof, which need {2 * count}")
-    values = [_INFINITE[w.lower()] if w.lower() in _INFINITE else number(line, w) * scale for w in words]
-    pairs = tuple(zip(values[::2], values[1::2], strict=True))
-    if any(low > high for low, high in pairs):
-        raise line.fault("a lower limit is above its upper limit")
-    return pairs
+    return Bone(name, direction, length, axis, axis_order, rotations)
 
 
 def _parents(lines: Iterable[Line], bones: Mapping[str, tuple[Bone, Line]]) -> dict[str, Line]:

@@ -50,8 +50,8 @@ class Compact:
 
 def settled_cells(runs: Sequence[RunRow]) -> list[RunRow]:
     """Return the newest finished or diverged run of each spec, seed and data; `runs` must be ordered newest last."""
-    newest = {(run.spec_hash, run.seed, run.dataset_hash): run for run in runs if run.state.settled}
-    return [run for run in runs if newest.get((run.spec_hash, run.seed, run.dataset_hash)) is run]
+    newest = {run.cell: run for run in runs if run.state.settled}
+    return [run for run in runs if newest.get(run.cell) is run]
 
 
 def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], wanted: Wanted) -> Compact:

@@ -123,10 +123,10 @@ def decide_fates(here: Connection, there: Connection) -> list[MergedRun]:
     by_id = {run.id: run for run in ours}
     cells: dict[tuple[str, int, str | None], list[RunRow]] = {}
     for run in ours:
-        cells.setdefault(_cell(run), []).append(run)
+        cells.setdefault(run.cell, []).append(run)
     merged = []
     for run in queries.runs(there):
-        rivals = [by_id[run.id]] if run.id in by_id else cells.get(_cell(run), [])
+        rivals = [by_id[run.id]] if run.id in by_id else cells.get(run.cell, [])
         settled = [rival for rival in rivals if rival.state.settled]
         if any(item.is_alive() for item in (run, *rivals)):
             merged.append(MergedRun(run, Fate.BUSY))
@@ -137,10 +137,6 @@ def decide_fates(here: Connection, there: Connection) -> list[MergedRun]:
         else:
             merged.append(_with_an_unfinished(here, there, run, rivals))
     return merged
-
-
-def _cell(run: RunRow) -> tuple[str, int, str | None]:
-    return run.spec_hash, run.seed, run.dataset_hash
 
 
 def _between_settled(here: Connection, there: Connection, run: RunRow, rivals: Sequence[RunRow]) -> MergedRun:
