@@ -134,13 +134,14 @@ class TrainingLoop:
 
         Raises UnfitState when the state is not one of such a loop; some of it may be loaded by then.
         """
-        parts, best = self.learner.parts(), fitted(state.get("best"), self.state_dict()["best"], "best")
-        if state.keys() != self.state_dict().keys() or not isinstance(state["learner"], dict):
+        own, parts = self.state_dict(), self.learner.parts()
+        if state.keys() != own.keys() or not isinstance(state["learner"], dict):
             raise UnfitState("it has other entries")
         if state["learner"].keys() != parts.keys():
             raise UnfitState("learner has other entries")
         self.epoch, self.snapshot = fitted_number(state["epoch"], 0, self.spec.epochs, "epoch"), {}
-        self.best = best | {"epoch": fitted_number(best["epoch"], 0, self.epoch, "best.epoch")}
+        self.best = fitted(state["best"], own["best"], "best")
+        fitted_number(self.best["epoch"], 0, self.epoch, "best.epoch")
         for name, part in parts.items():
             load_part(part, state["learner"][name], f"learner.{name}")
         self.generators.load_state_dict(state["generators"])

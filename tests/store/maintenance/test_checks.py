@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store
 from ssmail.store.maintenance.checks import check
@@ -48,6 +49,20 @@ def test_a_run_that_is_being_computed_is_no_problem(store: Store) -> None:
     change(store.where, "UPDATE run SET heartbeat = '2026-01-01 00:00:00'")
     (problem,) = check(store.where)  # negative control: the same run, silent
     assert (problem.check, problem.subject) == ("stale", store.runs()[0].id)
+
+
+def test_the_checkpoint_of_a_run_at_work_may_change(store: Store) -> None:
+    spec = build_spec("ssail", "yjunction", "smoke")
+    writer = store.start_run(spec, 0, dataset_hash=None, device="cpu")
+    path = store.checkpoint_root / writer.run_id / "last.pt"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"one")
+    writer.artifact("last.pt", path)
+    path.write_bytes(b"two")
+    assert check(store.where) == []
+    writer.finish(RunState.INTERRUPTED)
+    (problem,) = check(store.where)  # negative control
+    assert problem.check == "checkpoints"
 
 
 def test_a_database_that_cannot_be_opened_is_not_called_damaged(filled: Path) -> None:
