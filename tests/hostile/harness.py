@@ -147,14 +147,17 @@ def hold(folder: Path, *arguments: object) -> tuple[int, str, str]:
 
 
 def held(code: int, out: str, err: str) -> None:
-    """Assert that a command ended as one may: with a code of its own, and printable text of bearable length."""
+    """Assert that a command ended as one may: with a code of its own, and printable text of bearable length.
+
+    With exit code 1 and a result on stdout, the result is the reason (`ssmail db check`, `ssmail explain`).
+    """
     assert code in (0, 1, 2, 3), code
     assert "Traceback" not in err, err
     assert "unexpected " not in err, err
     for text in (out, err):
         bad = [character for character in text if not character.isprintable() and character not in "\n"]
         assert not bad, (bad, text)
-    if code in (1, 2):
+    if code == 2 or (code == 1 and not out):
         *_, last = err.splitlines() or [""]
         assert last.startswith("ssmail: "), err
         assert len(last) <= len("ssmail: ") + LONGEST, last

@@ -21,7 +21,7 @@ from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 
 COMMANDS = {
     "yjunction": "ssmail generate-yjunction",
@@ -109,7 +109,8 @@ class _File:
             with archive:
                 self.contents: dict[str, Any] = {key: archive[key] for key in archive.files}
         except FileNotFoundError:
-            raise InputError(f"there is no file {path}; make it with `{command} --out {path}`") from None
+            remedy = command_line(*command.split(), "--out", path)
+            raise InputError(f"there is no file {path}; make it with `{remedy}`") from None
         except (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError) as error:
             raise self.fault(f"{path} is truncated or not an .npz file") from error
 

@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import printable
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
@@ -177,7 +178,7 @@ def draw(record: BetaRecord) -> Figure:
         upper.set_ylabel("test error, mode_mse\n(squared scaled units)")
         lower.set_ylim(-0.02, 0.52)
         lower.set_ylabel("lane_balance\n(share)")
-        lower.set_xticks(range(len(record.columns)), [_short(column.label) for column in record.columns])
+        lower.set_xticks(range(len(record.columns)), [_short(style.literal(column.label)) for column in record.columns])
         lower.set_xlabel("β (fraction of the epochs, evenly spaced values)")
         for axes in (upper, lower):
             axes.grid(False, axis="x")
@@ -204,10 +205,12 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
         x = _places(index, len(column.error))
         finite = np.isfinite(column.error)
         (points,) = axes.plot(x[finite], column.error[finite], ".", color=POINTS, ms=5, mew=0, alpha=0.8)
-        points.set_gid(f"runs-{column.label}")
+        points.set_gid(printable(f"runs-{column.label}"))
         if column.diverged:
             top = np.full(column.diverged, axes.get_ylim()[1])
-            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(f"diverged-{column.label}")
+            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(
+                printable(f"diverged-{column.label}")
+            )
     lowest = np.array([np.fmin.reduce(column.error) for column in record.columns])
     summary = _over_columns([column.error_summary for column in record.columns])
     line = _draw_centres(axes, Summary(summary.centre, style.cut_low(summary.low, lowest), summary.high))
@@ -223,7 +226,9 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
 def _draw_balances(axes: Axes, record: BetaRecord) -> None:
     for index, column in enumerate(record.columns):
         x = _places(index, len(column.balance))
-        axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
+        axes.plot(
+            x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=printable(f"balances-{column.label}")
+        )
     _draw_centres(axes, _over_columns([column.balance_summary for column in record.columns]))
 
 

@@ -151,7 +151,7 @@ def _draw_legend(figure: Figure, record: LandscapeRecord, landscape: Landscape) 
     run = record.run
     kinds = {"expert": landscape_grids.EXPERT, "policy": landscape_grids.POLICY}
     handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
-    title = f"{run.method}, seed {run.seed}: epoch {landscape.epoch} of {_epochs(run)}"
+    title = f"{style.literal(run.method)}, seed {run.seed}: epoch {landscape.epoch} of {_epochs(run)}"
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=2)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 from matplotlib.figure import Figure
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, printable
 from ssmail.plots import FigureRecord, style
 from ssmail.plots.provenance import FORMATS, Provenance
 
@@ -37,8 +37,13 @@ def save_figure(stem: str, record: FigureRecord, figure: Figure, outdir: Path, f
 
 
 def csv_text(table: pd.DataFrame) -> str:
-    """The CSV of what a figure shows."""
-    return table.to_csv(index=False, na_rep="nan", lineterminator="\n")
+    """The CSV of what a figure shows, with texts made printable."""
+    shown = table.copy(deep=False)
+    for name in shown.select_dtypes(exclude="number"):
+        odd = {text: printable(text) for text in shown[name] if isinstance(text, str) and text != printable(text)}
+        if odd:
+            shown[name] = [odd.get(value, value) if isinstance(value, str) else value for value in shown[name]]
+    return shown.to_csv(index=False, na_rep="nan", lineterminator="\n")
 
 
 def digest(csv: str) -> str:

@@ -21,7 +21,7 @@ from PIL import Image
 
 from ssmail.data import expert_sets
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
-from ssmail.errors import InputError, unknown_name
+from ssmail.errors import InputError, printable, unknown_name
 from ssmail.plots import style
 from ssmail.plots.provenance import Provenance
 
@@ -237,7 +237,7 @@ def _draw_pose(axes: Axes, record: SkeletonRecord, pose: Floats, thickness: floa
                     lw=WIDTHS[name] * thickness,
                     solid_capstyle="round",
                     zorder=2 + order,
-                    gid=record.joints[joint],
+                    gid=printable(record.joints[joint]),
                 )
     if HEAD in record.joints:
         end = record.joints.index(HEAD)

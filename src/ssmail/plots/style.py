@@ -18,6 +18,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import printable, shortened
 
 COLUMN_WIDTH = 3.4  # inches: one column of a two-column page
 RESOLUTION = 300  # dots per inch of a PNG
@@ -25,6 +26,7 @@ RESOLUTION = 300  # dots per inch of a PNG
 REFERENCE = "#222222"
 LANE = "#D4D4D4"
 REACH = 3.0
+_LABEL = 120  # characters
 AGENTS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 # The style sheet. Fonts: embedded as text in a PDF, as paths in an SVG. The salt makes SVG ids repeatable.
@@ -101,6 +103,15 @@ def new_figure(height: float) -> Figure:
     figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def literal(text: str) -> str:
+    """Return a stored text as matplotlib has to get it, to show it as it is, on one line of bearable length.
+
+    Between two dollars matplotlib would read mathematics; a label that begins with _ it would leave out of the legend.
+    """
+    shown = shortened(printable(text), _LABEL).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def log_axis(axes: Axes, limits: tuple[float, float]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, select, table, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, masked, shortened
 from ssmail.store.schema import REVISIONS, metadata
 
 BUSY_SECONDS = 120.0
@@ -39,7 +39,7 @@ def connect(where: str | Path) -> Engine:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
         raise InputError(
-            f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
+            f"no driver for the database URL {name_of(url)} is installed ({error}); install it with pip"
         ) from error
     try:
         with explained_errors(describe(engine)):
@@ -71,7 +71,7 @@ def writing(engine: Engine) -> Iterator[Connection]:
 
 def describe(engine: Engine) -> str:
     """Return the database's path, or its URL without the password, for messages."""
-    return _show(engine.url)
+    return name_of(engine.url)
 
 
 def as_url(where: str | Path) -> URL:
@@ -83,12 +83,15 @@ def as_url(where: str | Path) -> URL:
         return _file_url(Path(where).expanduser())
     try:
         url = make_url(where)
-    except ArgumentError as error:
-        raise InputError(f"{where!r} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from error
+    except (ArgumentError, ValueError):
+        shown = shortened(masked(where), 100)
+        raise InputError(f"{shown} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from None
     if url.get_backend_name() != "sqlite":
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
-        raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
+        raise InputError(
+            f"{shortened(masked(where), 100)} is not a file on disk, which ssmail needs; give the path of a file"
+        )
     return _file_url(Path(str(url.database)))
 
 
@@ -150,10 +153,11 @@ def _explained(reason: str, where: str) -> SsmailError:
     return SsmailError(f"an operation on the database {where} failed: {reason}")
 
 
-def _show(url: URL) -> str:
+def name_of(url: URL) -> str:
+    """Return the path of an SQLite database, or the URL of another without passwords, for messages."""
     if url.get_backend_name() == "sqlite" and url.database:
         return url.database
-    return url.render_as_string(hide_password=True)
+    return masked(url.render_as_string(hide_password=True))
 
 
 def _file_url(path: Path) -> URL:
