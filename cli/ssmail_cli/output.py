@@ -10,20 +10,24 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ssmail.errors import InputError, SsmailError, masked, printable, sentence
+from ssmail.errors import InputError, SsmailError, masked, printable, sentence, shortened
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+LONGEST_CELL = 4000  # characters in a table; a traceback has fewer
 Row = Mapping[str, Any]
+
+
+_remarks: list[Callable[[], str | None]] = []
 
 
 class Format(StrEnum):
@@ -51,6 +55,18 @@ def note(*lines: object) -> None:
     """Print a remark on stderr, beside the result."""
     for line in lines:
         print(_line(line), file=sys.stderr)
+
+
+def note_at_end(remark: Callable[[], str | None]) -> None:
+    """Print what `remark` returns when the command ends: a note on stderr, or nothing."""
+    _remarks.append(remark)
+
+
+def print_remarks() -> None:
+    """Print the notes that are due, each once."""
+    while _remarks:
+        if text := _remarks.pop(0)():
+            note(text)
 
 
 def complain(text: str) -> None:
@@ -121,7 +137,7 @@ def short(value: Any, digits: int = 4) -> str:
         return f"{value:%m-%d %H:%M}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(short(item, digits) for item in value)}]"
-    return str(value)
+    return shortened(str(value), LONGEST_CELL)
 
 
 def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:

@@ -1,5 +1,6 @@
 """The tables of the store; docs/database.md explains each column. Every change here needs an Alembic revision."""
 
+import re
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
@@ -9,6 +10,11 @@ from sqlalchemy.types import TypeDecorator
 
 REVISIONS = ("0001",)
 """All schema revisions that this version of ssmail knows, oldest first; it reads and writes the last one."""
+
+
+def is_run_id(value: object) -> bool:
+    """Return whether a value is a run id: 32 hexadecimal digits in lower case. Only such an id may become a path."""
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{32}", value) is not None
 
 
 class RunState(StrEnum):
