@@ -24,6 +24,7 @@ LONGEST_TEXT = 1_000_000  # characters of a spec or an error
 LARGEST = 2**63 - 1
 _SHOWN = 40  # characters of a value in a message
 _DEEPEST = 16  # levels of a spec
+_ALWAYS = ("method", "environment", "profile", "training", "forecast")  # what every spec had; forecast if on mocap
 _KINDS = ("finite", "nan", "inf", "-inf")
 
 
@@ -179,7 +180,8 @@ def _check_run(values: dict[str, Any]) -> None:
 def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     """Return what is wrong with a stored spec, or None; and its method, environment and profile.
 
-    Keys and choices that this ssmail does not know are not wrong: a later one may have written them.
+    Keys and choices that this ssmail does not know are not wrong: a later one may have written them. Nor is the lack of
+    keys and sections, which an earlier one may not have had, except of _ALWAYS.
     """
     try:
         spec = json.loads(text)
@@ -192,7 +194,7 @@ def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
         RunSpec.model_validate_json(json.dumps(spec))
     except (TypeError, AttributeError, ValidationError) as error:
         problems = error.errors(include_url=False) if isinstance(error, ValidationError) else []
-        serious = [item for item in problems if not _is_of_later_version(item)]
+        serious = [item for item in problems if not _is_of_another_version(item)]
         if serious or not problems:
             key = ".".join(str(part) for part in serious[0]["loc"]) if serious else ""
             where = f" at {shortened(key, _SHOWN)}" if key else ""
@@ -200,14 +202,16 @@ def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     method, environment, profile = (spec[key] for key in ("method", "environment", "profile"))
     known = method in METHODS and environment in ENVIRONMENTS
     for name in required_sections(method, environment) if known else ():
-        if spec.get(name) is None:
+        if name in _ALWAYS and spec.get(name) is None:
             return f"its spec has no section {name}", None, None, None
     return None, method, environment, profile
 
 
-def _is_of_later_version(problem: Mapping[str, Any]) -> bool:
-    kind = problem["type"]
-    return kind == "extra_forbidden" or (kind == "literal_error" and isinstance(problem["input"], str))
+def _is_of_another_version(problem: Mapping[str, Any]) -> bool:
+    """Return whether what a spec lacks or has is what an earlier or later ssmail may have written."""
+    kind, place = problem["type"], problem["loc"][0]
+    is_choice = kind == "literal_error" and isinstance(problem["input"], str)
+    return kind == "extra_forbidden" or is_choice or (kind == "missing" and place not in _ALWAYS)
 
 
 def _is_plain(spec: Any) -> bool:
