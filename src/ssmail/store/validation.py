@@ -24,7 +24,8 @@ LONGEST_TEXT = 1_000_000  # characters of a spec or an error
 LARGEST = 2**63 - 1
 _SHOWN = 40  # characters of a value in a message
 _DEEPEST = 16  # levels of a spec
-_ALWAYS = ("method", "environment", "profile", "training", "forecast")  # what every spec had; forecast if on mocap
+_READ = ("training", "forecast")  # sections that are read of stored specs
+_NEEDED = ("method", "environment", "profile", "training.epochs")  # of a spec, by whatever version
 _KINDS = ("finite", "nan", "inf", "-inf")
 
 
@@ -180,8 +181,8 @@ def _check_run(values: dict[str, Any]) -> None:
 def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     """Return what is wrong with a stored spec, or None; and its method, environment and profile.
 
-    Keys and choices that this ssmail does not know are not wrong: a later one may have written them. Nor is the lack of
-    keys and sections, which an earlier one may not have had, except of _ALWAYS.
+    Keys that are missing, and keys and choices that this ssmail does not know, are not wrong: an earlier or a later one
+    may have written them.
     """
     try:
         spec = json.loads(text)
@@ -202,16 +203,17 @@ def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     method, environment, profile = (spec[key] for key in ("method", "environment", "profile"))
     known = method in METHODS and environment in ENVIRONMENTS
     for name in required_sections(method, environment) if known else ():
-        if name in _ALWAYS and spec.get(name) is None:
+        if name in _READ and spec.get(name) is None:
             return f"its spec has no section {name}", None, None, None
     return None, method, environment, profile
 
 
 def _is_of_another_version(problem: Mapping[str, Any]) -> bool:
-    """Return whether what a spec lacks or has is what an earlier or later ssmail may have written."""
-    kind, place = problem["type"], problem["loc"][0]
-    is_choice = kind == "literal_error" and isinstance(problem["input"], str)
-    return kind == "extra_forbidden" or is_choice or (kind == "missing" and place not in _ALWAYS)
+    """Return whether a key is unknown, or has an unknown choice, or is one that runs are read without."""
+    kind, key = problem["type"], ".".join(map(str, problem["loc"]))
+    if kind == "missing":
+        return key not in _NEEDED and not key.startswith("forecast.")
+    return kind == "extra_forbidden" or (kind == "literal_error" and isinstance(problem["input"], str))
 
 
 def _is_plain(spec: Any) -> bool:
