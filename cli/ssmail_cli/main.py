@@ -1,6 +1,7 @@
 """The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
 import difflib
+import os
 import sys
 from typing import Annotated, Any
 
@@ -63,6 +64,7 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code; a failure prints one line, and a traceback with SSMAIL_DEBUG=1."""
+    os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
         sys.stdout.flush()
@@ -78,6 +80,10 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
             return _complain(_usage(error), ExitCode.BAD_INPUT)
+        if isinstance(error, OSError) and error.filename and not os.environ.get("SSMAIL_DEBUG"):
+            return _complain(
+                f"{error.filename} cannot be used: {error.strerror}; give another path", ExitCode.BAD_INPUT
+            )
         return _complain(error_line(error), ExitCode.FAILURE)
     return code if isinstance(code, int) else ExitCode.OK
 
