@@ -2,15 +2,18 @@
 
 import difflib
 import os
+import re
 import sys
 from typing import Annotated, Any
 
 import typer
 
 from ssmail import __version__
-from ssmail.errors import ExitCode, SsmailError
+from ssmail.errors import ExitCode, SsmailError, shortened
 from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
 from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, say
+
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
 
 app = typer.Typer(
     name="ssmail",
@@ -64,6 +67,9 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code; a failure prints one line, and a traceback with SSMAIL_DEBUG=1."""
+    for argument in arguments:
+        if _NO_TEXT.search(argument):  # neither a database nor a file format can hold it
+            return _complain(f"the argument {shortened(argument, 60)} is not UTF-8 text; rename it", ExitCode.BAD_INPUT)
     os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
