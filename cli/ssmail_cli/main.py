@@ -1,15 +1,19 @@
 """The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
 import difflib
+import os
+import re
 import sys
 from typing import Annotated, Any
 
 import typer
 
 from ssmail import __version__
-from ssmail.errors import ExitCode, SsmailError
+from ssmail.errors import ExitCode, SsmailError, shortened
 from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
 from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, print_remarks, say
+
+_NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
 
 app = typer.Typer(
     name="ssmail",
@@ -63,6 +67,10 @@ def main() -> None:
 
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code; a failure prints one line, and a traceback with SSMAIL_DEBUG=1."""
+    for argument in arguments:
+        if _NO_TEXT.search(argument):  # neither a database nor a file format can hold it
+            return _complain(f"the argument {shortened(argument, 60)} is not UTF-8 text; rename it", ExitCode.BAD_INPUT)
+    os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         try:
             code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
@@ -81,6 +89,10 @@ def run(arguments: list[str]) -> int:
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
             return _complain(_usage(error), ExitCode.BAD_INPUT)
+        if isinstance(error, OSError) and error.filename and not os.environ.get("SSMAIL_DEBUG"):
+            return _complain(
+                f"{error.filename} cannot be used: {error.strerror}; give another path", ExitCode.BAD_INPUT
+            )
         return _complain(error_line(error), ExitCode.FAILURE)
     return code if isinstance(code, int) else ExitCode.OK
 

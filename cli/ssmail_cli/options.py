@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError, SsmailError, command_line, unknown_name
+from ssmail.errors import InputError, SsmailError, command_line, shortened, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import counted
@@ -123,7 +123,13 @@ StatOfFigures = Annotated[
 
 def is_missing(database: str) -> bool:
     """Return whether this is the path of a file that does not exist; False for a URL."""
-    return "://" not in database and not Path(database).expanduser().exists()
+    if "://" in database:
+        return False
+    try:
+        return not Path(database).expanduser().exists()
+    except (OSError, RuntimeError, ValueError) as error:  # too long a name; nobody's home; a null byte
+        reason = getattr(error, "strerror", None) or str(error).rstrip(".").lower()
+        raise InputError(f"{shortened(database, 120)} is no path of a database ({reason}); give another --db") from None
 
 
 def open_store(database: str) -> "Store":
@@ -183,14 +189,24 @@ def parse_seeds(text: str) -> list[int]:
     for part in text.split(","):
         first, dash, last = part.strip().partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise InputError(f"--seeds takes whole numbers and ranges such as 0-4 or 0,2,5, not '{text}'.")
+            shown = shortened(text, 60)
+            raise InputError(f"--seeds takes whole numbers and ranges such as 0-4 or 0,2,5, not '{shown}'.")
+        if max(len(first), len(last)) > 10:  # digits of 2**31
+            raise _too_many(text)
         low, high = int(first), int(last or first)
         if low > high:
             raise InputError(f"the range {part.strip()} in --seeds runs backwards; write {high}-{low}.")
         if high - low >= MOST_SEEDS or high >= 2**31:
-            raise InputError(f"--seeds {text} is more than {MOST_SEEDS} seeds or a seed above 2147483647; give less.")
+            raise _too_many(text)
         seeds.update(dict.fromkeys(range(low, high + 1)))
+        if len(seeds) > MOST_SEEDS:
+            raise _too_many(text)
     return list(seeds)
+
+
+def _too_many(text: str) -> InputError:
+    shown = shortened(text, 60)
+    return InputError(f"--seeds {shown} is more than {MOST_SEEDS} seeds or a seed above 2147483647; give less.")
 
 
 def pick_device(choice: Device) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from ssmail.errors import InputError, command_line
+from ssmail.errors import InputError, command_line, shortened
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
@@ -123,7 +123,9 @@ def parse_values(text: str) -> list[Any]:
     except yaml.YAMLError:
         values = None
     if not values or None in values or text.rstrip().endswith(","):
-        raise InputError(f"--values takes values with commas between them, such as 0,0.15,1, not '{text}'.")
+        raise InputError(
+            f"--values takes values with commas between them, such as 0,0.15,1, not '{shortened(text, 60)}'."
+        )
     return list(values)
 
 

@@ -34,6 +34,14 @@ def command(folder: Path, *words: str) -> list[str]:
     return [name, "--dry-run", "--profile", "smoke", "--db", str(folder / "absent.db"), *rest]
 
 
+@pytest.mark.parametrize("word", WORDS, ids=lambda word: repr(word[:20]))
+def test_each_odd_word(folder: Path, word: str) -> None:
+    for key in ("sac.gamma", "training.epochs", "self_supervision.label"):
+        hold(folder, *command(folder, "train", "--set", f"{key}={word}"))
+    hold(folder, *command(folder, "train", "--set", f"{word}=1"))
+    hold(folder, *command(folder, "ablate", "label", f"--values=identity,{word}"))
+
+
 @cases(60, 1200)
 @given(key=KEYS, value=TEXTS, method=st.sampled_from(METHODS), environment=st.sampled_from(ENVIRONMENTS))
 def test_a_value_of_a_key(folder: Path, key: str, value: str, method: str, environment: str) -> None:

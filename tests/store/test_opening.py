@@ -152,7 +152,10 @@ REFUSED: dict[str, tuple[Callable[[Path], str], str]] = {
     "memory": (lambda _: "sqlite://", "is not a file on disk"),
     "URI": (lambda folder: f"sqlite:///file:{folder}/a.db?uri=true", "is not a file on disk"),
     "no URL": (lambda _: "://", "neither a path nor a database URL"),
-    "no dialect": (lambda _: "nosuch://host/name", r"no driver for the database URL nosuch://host/name"),
+    "no dialect": (lambda _: "nosuch://host/name", "nosuch is no database that ssmail knows; use sqlite or postgresql"),
+    "any module": (lambda _: "sqlite+idlelib:///x.db", "idlelib is no database that ssmail knows"),
+    "no driver": (lambda _: "postgresql://host/name", r"no driver for the database URL postgresql://host/name"),
+    "long": (lambda _: 300 * "a", "is no path; give that of a database file"),
 }
 
 
@@ -167,8 +170,8 @@ def test_what_cannot_be_used_is_one_sentence(make: Callable[[Path], str], senten
 
 
 def test_a_password_is_not_shown() -> None:
-    with pytest.raises(InputError, match=r"nosuch://me:\*\*\*@host") as caught:
-        Store.open("nosuch://me:secret@host/name")
+    with pytest.raises(InputError, match=r"postgresql://me:\*\*\*@host") as caught:
+        Store.open("postgresql://me:secret@host/name")
     assert "secret" not in str(caught.value)
 
 

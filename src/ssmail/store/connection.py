@@ -21,6 +21,13 @@ from ssmail.store.schema import REVISIONS, metadata
 
 BUSY_SECONDS = 120.0
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # how a journal ends that names another file (SQLite's file format)
+BACKENDS = ("sqlite", "postgresql")
+DRIVERS = (
+    "sqlite",
+    "sqlite+pysqlite",
+    "postgresql",
+    *(f"postgresql+{name}" for name in ("psycopg", "psycopg2", "pg8000")),
+)
 _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
@@ -89,13 +96,17 @@ def as_url(where: str | Path) -> URL:
     except (ArgumentError, ValueError):
         shown = shortened(masked(where), 100)
         raise InputError(f"{shown} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from None
+    if url.drivername not in DRIVERS:  # SQLAlchemy would import whatever package calls itself so
+        raise InputError(
+            f"{shortened(url.drivername, 60)} is no database that ssmail knows; use {' or '.join(BACKENDS)}"
+        )
     if url.get_backend_name() != "sqlite":
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
         raise InputError(
             f"{shortened(masked(where), 100)} is not a file on disk, which ssmail needs; give the path of a file"
         )
-    return _file_url(Path(str(url.database)))
+    return _file_url(Path(str(url.database)), home=False)
 
 
 def make_engine(url: URL) -> Engine:
@@ -224,9 +235,14 @@ def name_of(url: URL) -> str:
     return masked(url.render_as_string(hide_password=True))
 
 
-def _file_url(path: Path) -> URL:
-    path = path.absolute()
-    if path.is_dir():
+def _file_url(where: str | Path, home: bool = True) -> URL:
+    """Return the URL of a file, whose path may begin with ~ if `home`. Raises InputError for a folder, or no path."""
+    try:
+        path = (Path(where).expanduser() if home else Path(where)).absolute()
+        is_folder = path.is_dir()
+    except (OSError, RuntimeError, ValueError) as error:  # too long a name; nobody's home; a null byte
+        raise InputError(f"{shortened(str(where), 120)!r} is no path; give that of a database file") from error
+    if is_folder:
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is a pipe or a device; give the path of a file")
