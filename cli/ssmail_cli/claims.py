@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail_cli import options
-from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, short, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.claims import Part, Sample
@@ -65,9 +65,9 @@ def claims(
         print_rows([row for found in judgements for row in _part_rows(found)], {}, kind)
         return
     for found in judgements:
-        typer.echo("\n".join([*_claim_lines(found), ""]))
+        say(*_claim_lines(found), "")
     print_table([_summary(found) for found in judgements], SUMMARY)
-    typer.echo("\n".join(_wrapped(LEGEND, 0)))
+    say(*_wrapped(LEGEND, 0))
 
 
 def _summary(found: "Judgement") -> dict[str, Any]:

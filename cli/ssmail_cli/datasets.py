@@ -8,7 +8,7 @@ import typer
 
 from ssmail.errors import InputError
 from ssmail_cli.options import Json
-from ssmail_cli.output import note, write_json
+from ssmail_cli.output import note, say, write_json
 
 if TYPE_CHECKING:
     from ssmail.data.trajectories import ExpertSet
@@ -86,7 +86,7 @@ def prep_mocap(
         typer.Option("--source", help="Folder or zip file that contains 35.asf and 35_01.amc ... at any depth."),
     ] = None,
     download: Annotated[
-        bool, typer.Option("--download", help="Fetch the files from the (slow) CMU site into --cache instead.")
+        bool, typer.Option("--download", help="Fetch the files from the CMU site (slow, plain HTTP) into --cache.")
     ] = False,
     cache: Annotated[
         Path | None,
@@ -126,7 +126,7 @@ def prep_mocap(
         from ssmail.data.mocap.download import fetch
 
         trials = (*wanted.train, *wanted.validation, *wanted.test)
-        source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing)
+        source = fetch(subject, trials, cache or Path(DEFAULT_CACHE), allow_missing=allow_missing, report=note)
     experts = prepare(source, wanted, allow_missing=allow_missing)
     expert_sets.save(experts, out, force=force)
     _print_set(experts, out, as_json)
@@ -150,7 +150,7 @@ def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_j
         write_json({"path": out, "hash": experts.hash, "parameters": experts.parameters}, None)
         return
     sizes = f"{len(experts.train)}/{len(experts.validation)}/{len(experts.test)}"
-    typer.echo(f"wrote {out}: {sizes} training/validation/test trajectories, hash {experts.hash[:16]}")
+    say(f"wrote {out}: {sizes} training/validation/test trajectories, hash {experts.hash[:16]}")
 
 
 def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
@@ -178,12 +178,12 @@ def _print_set(experts: "ExpertSet", out: Path, as_json: bool) -> None:
             None,
         )
     else:
-        typer.echo(
+        say(
             f"wrote {out}: {'/'.join(map(str, windows))} training/validation/test windows of "
             f"{len(experts.joints)} joints, hash {experts.hash[:16]}"
         )
         for what, (low, high) in scaling.items():
-            typer.echo(f"training {what} from {low:#.6g} to {high:#.6g}")
+            say(f"training {what} from {low:#.6g} to {high:#.6g}")
     if missing:
         trials = ", ".join(f"{trial:02d}" for trial in missing)
         note(f"trials that do not exist and are not in the set: {trials}")

@@ -9,7 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
-from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.reads import Contents
@@ -39,10 +39,10 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
     if kind is Format.JSON:
         write_json({**asdict(found), "array_share": found.array_share, "runs": rows}, None)
     elif kind is Format.CSV:
-        note(_summary(found))
+        note(*_summary(found))
         print_rows(rows, COUNT_COLUMNS, kind)
     else:
-        print(_summary(found))
+        say(*_summary(found))
         print_table(rows, COUNT_COLUMNS)
 
 
@@ -59,10 +59,10 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     if as_json:
         write_json(asdict(done), None)
     elif done.before == done.after:
-        print(f"{done.path} already has the newest schema, {done.after}")
+        say(f"{done.path} already has the newest schema, {done.after}")
     else:
         kept = f"; the old state is in {done.backup}" if done.backup else ""
-        print(f"{done.path}: from schema {done.before or 'none'} to {done.after}{kept}")
+        say(f"{done.path}: from schema {done.before or 'none'} to {done.after}{kept}")
 
 
 @app.command()
@@ -78,7 +78,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
     if as_json:
         write_json([asdict(problem) for problem in problems], None)
     for problem in problems if not as_json else ():
-        print(f"{problem.check}: {problem.problem}; {problem.remedy}")
+        say(f"{problem.check}: {problem.problem}; {problem.remedy}")
     note(f"{db}: {counted(len(problems), 'problem')}" if problems else f"{db}: no problem found")
     if problems:
         raise typer.Exit(ExitCode.FAILURE)
@@ -100,7 +100,7 @@ def backup(
     if as_json:
         write_json({"path": file, "size_bytes": size}, None)
     else:
-        print(f"wrote {file}, {_size(size)}")
+        say(f"wrote {file}, {_size(size)}")
 
 
 @app.command()
@@ -126,8 +126,8 @@ def merge(
         write_json({**names, "runs": runs, "differences": differences, "without_checkpoints": without}, None)
         return
     for difference in done.differences:
-        print(_difference(difference))
-    print(f"merged {done.other} into {done.target}: {_fates(done)}")
+        say(_difference(difference))
+    say(f"merged {done.other} into {done.target}: {_fates(done)}")
     if done.without_checkpoints:
         note(f"{counted(len(done.without_checkpoints), 'run')} came without all checkpoints: {other} lacks them")
 
@@ -174,16 +174,16 @@ def export(
         _print_export(done, needed, others)
 
 
-def _summary(found: "DatabaseInformation") -> str:
+def _summary(found: "DatabaseInformation") -> list[str]:
     revision = found.revision or "none"
     if found.revision != found.newest_revision:
         revision += f" ({found.newest_revision} is the newest; `ssmail db upgrade`)"
     runs = counted(sum(count.runs for count in found.runs), "run")
-    return (
-        f"{found.path}: schema {revision}, {_size(found.size_bytes)} ({_size(found.free_bytes)} of it free), {runs}\n"
+    return [
+        f"{found.path}: schema {revision}, {_size(found.size_bytes)} ({_size(found.free_bytes)} of it free), {runs}",
         f"{counted(found.metrics, 'value')} of metrics; {counted(found.arrays, 'array')}, {_size(found.array_bytes)} "
-        f"({100 * found.array_share:.0f} % of the size); {counted(found.artifacts, 'checkpoint file')}"
-    )
+        f"({100 * found.array_share:.0f} % of the size); {counted(found.artifacts, 'checkpoint file')}",
+    ]
 
 
 def _fates(done: "Merge") -> str:
@@ -214,7 +214,7 @@ def _difference(found: "Difference") -> str:
 
 def _print_export(done: "Compact", needed: "Contents", others: int) -> None:
     """Print the file on stdout, and what is not in it on stderr."""
-    print(f"wrote {done.path}, {_size(done.size_bytes)}: {counted(done.runs, 'run')}")
+    say(f"wrote {done.path}, {_size(done.size_bytes)}: {counted(done.runs, 'run')}")
     note(
         f"left out: {counted(others, 'other run')}; {counted(done.left_out_artifacts, 'checkpoint file')}; "
         f"{counted(done.left_out_metrics, 'value')} of metrics (kept: every last one, and the curves of "

@@ -9,7 +9,7 @@ import typer
 from ssmail.errors import ExitCode
 from ssmail.plots.formatting import short_code
 from ssmail_cli import options
-from ssmail_cli.output import Format, chosen_format, note, print_rows, short, write_json
+from ssmail_cli.output import Format, chosen_format, note, print_rows, say, short, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.explanation import Agreement, Explanation
@@ -40,9 +40,8 @@ def explain(
     if kind is Format.JSON:
         write_json(_as_json(found, agreement), None)
     else:
-        say = print if kind is Format.TABLE else note
-        for line in (*_heading(found), _verdict(agreement, db)):
-            say(line)
+        tell = say if kind is Format.TABLE else note
+        tell(*_heading(found), _verdict(agreement, db))
         if rows := _rows(found, agreement):
             print_rows(rows, COLUMNS, kind)
     if agreement is not None and agreement.agrees is False:

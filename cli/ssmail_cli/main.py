@@ -1,7 +1,6 @@
 """The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
 import difflib
-import os
 import sys
 from typing import Annotated, Any
 
@@ -10,7 +9,7 @@ import typer
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError
 from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
-from ssmail_cli.output import error_line
+from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, say
 
 app = typer.Typer(
     name="ssmail",
@@ -38,7 +37,7 @@ app.add_typer(db.app, name="db")
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"ssmail {__version__}")
+        say(f"ssmail {__version__}")
         raise typer.Exit
 
 
@@ -53,7 +52,13 @@ def _options(
 
 def main() -> None:
     """The entry point `ssmail`."""
-    sys.exit(run(sys.argv[1:]))
+    guard_streams()
+    code = run(sys.argv[1:])
+    try:
+        sys.stdout.flush()
+    except (OSError, OutputError):
+        discard_stdout()
+    sys.exit(code)
 
 
 def run(arguments: list[str]) -> int:
@@ -62,11 +67,13 @@ def run(arguments: list[str]) -> int:
         code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
         sys.stdout.flush()
     except SsmailError as error:
+        if isinstance(error, OutputError):
+            discard_stdout()
         return _complain(str(error), error.exit_code)
     except (KeyboardInterrupt, typer.Abort):
         return ExitCode.INTERRUPTED
     except BrokenPipeError:  # the reader of stdout, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        discard_stdout()
         return ExitCode.FAILURE
     except Exception as error:
         if hasattr(error, "format_message"):  # what Typer, whatever its version, raises for a wrong command line
@@ -76,7 +83,7 @@ def run(arguments: list[str]) -> int:
 
 
 def _complain(sentence: str, code: int) -> int:
-    print(f"ssmail: {sentence}", file=sys.stderr)
+    complain(sentence)
     return code
 
 

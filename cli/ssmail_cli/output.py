@@ -1,6 +1,11 @@
-"""Results on stdout, as a table for people or as CSV or JSON for programs; notes on stderr."""
+"""Results on stdout, as a table for people or as CSV or JSON for programs; notes on stderr.
+
+Nothing else in the command line prints. What is printed may come from a file of someone else, so each line and cell is
+made printable (`ssmail.errors.printable`), except in JSON, which escapes such characters itself.
+"""
 
 import csv
+import io
 import json
 import math
 import os
@@ -12,9 +17,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.data.atomic_file import atomic_write
+from ssmail.errors import InputError, SsmailError, masked, printable, sentence
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
 Row = Mapping[str, Any]
@@ -35,19 +42,44 @@ def chosen_format(as_json: bool, chosen: Format | None) -> Format:
     return chosen or (Format.TABLE if sys.stdout.isatty() else Format.CSV)
 
 
-def note(text: str) -> None:
+def say(*lines: object) -> None:
+    """Print lines of a result on stdout."""
+    for line in lines:
+        print(_line(line))
+
+
+def note(*lines: object) -> None:
     """Print a remark on stderr, beside the result."""
-    print(text, file=sys.stderr)
+    for line in lines:
+        print(_line(line), file=sys.stderr)
+
+
+def complain(text: str) -> None:
+    """Print on stderr, as one sentence, why the command fails."""
+    print(f"ssmail: {sentence(text)}", file=sys.stderr)
+
+
+def confirm(question: str) -> bool:
+    """Ask a question on the terminal, and return whether the answer is yes. Raises typer.Abort without an answer."""
+    import typer
+
+    return typer.confirm(_line(question), err=True)
+
+
+def progress_console() -> "Console":
+    """Return the console on stderr for live lines, whose texts have to be printable already."""
+    from rich.console import Console
+
+    return Console(stderr=True)
 
 
 def error_line(error: Exception) -> str:
     """Return the error as one line. With SSMAIL_DEBUG=1, an unexpected error is raised again."""
     if isinstance(error, SsmailError):
-        return str(error)
+        return sentence(str(error))
     if os.environ.get("SSMAIL_DEBUG"):
         raise error
-    what = " ".join(str(error).split())
-    return f"unexpected {type(error).__name__}: {what} (SSMAIL_DEBUG=1 shows the traceback)"
+    return sentence(f"unexpected {type(error).__name__}: {error} (SSMAIL_DEBUG=1 shows the traceback)")
 
 
 def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
@@ -61,10 +93,14 @@ def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) ->
 
 
 def write_csv(rows: Iterable[Row], columns: Sequence[str], out: Path | None) -> None:
-    """Write CSV with a header to a file, or to stdout (None). None becomes empty, NaN nan, a time ISO 8601."""
+    """Write CSV with a header to a file, or to stdout (None). None becomes empty, NaN nan, a time ISO 8601.
+
+    A text that begins with =, +, - or @ stays as it is, though a spreadsheet may take it for a formula: the usual
+    apostrophe before it would be wrong for every other program. Import CSV of someone else's runs as text.
+    """
     with _opened(out) as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
+        writer.writerow(printable(column) for column in columns)
         writer.writerows([_csv_cell(row.get(column)) for column in columns] for row in rows)
 
 
@@ -100,7 +136,9 @@ def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
         table = _table(rows, columns, gap, digits)
         if Measurement.get(console, unlimited, table).maximum <= console.width:
             break
-    console.print(table)
+    with console.capture() as capture:
+        console.print(table)
+    sys.stdout.write(capture.get())
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":
@@ -110,14 +148,21 @@ def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: in
     table = Table(box=None, pad_edge=False, padding=(0, gap, 0, 0))
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
-        table.add_column(heading, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
+        lines = Text("\n".join(map(printable, heading.split("\n"))))  # unlike a str, a Text is not read as markup
+        table.add_column(lines, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
     for row in rows:
-        table.add_row(*(Text(short(row.get(key), digits)) for key in columns))  # unlike a str, not read as markup
+        table.add_row(*(Text(printable(short(row.get(key), digits))) for key in columns))
     return table
+
+
+def _line(text: object) -> str:
+    return printable(masked(str(text)))
 
 
 def _csv_cell(value: Any) -> Any:
     plain = _json_value(value)
+    if isinstance(plain, str):
+        return printable(plain)
     return json.dumps(plain) if isinstance(plain, dict | list) else plain
 
 
@@ -130,18 +175,88 @@ def _json_value(value: Any) -> Any:
         return str(value)
     if isinstance(value, datetime):
         return value.isoformat(timespec="seconds")
-    return str(value) if isinstance(value, Path) else value
+    return value if value is None or isinstance(value, str | int | float) else str(value)
 
 
 @contextmanager
 def _opened(out: Path | None) -> Iterator[TextIO]:
-    """Open a file to write, or stdout (None). Raises InputError when it cannot be written."""
+    """Open a file, which is written whole or not at all, a device, or stdout (None).
+
+    Raises InputError when it cannot be written.
+    """
     if out is None:
         yield sys.stdout
         return
     try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with out.open("w", encoding="utf-8", newline="") as file:
+        if out.exists() and not out.is_file():  # such as /dev/stdout or a pipe; a folder raises
+            with out.open("w", encoding="utf-8", newline="") as file:
+                yield file
+            return
+        with atomic_write(out) as partial, partial.open("w", encoding="utf-8", newline="") as file:
             yield file
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}; choose another --out.") from None
+
+
+class OutputError(SsmailError):
+    """The result cannot be written to stdout."""
+
+
+class _Stream(io.RawIOBase):
+    """A standard stream below its buffer. What stderr (`strict` off) cannot write is dropped: training must go on.
+
+    On stdout (`strict`) it is an OutputError, except when the reader of a pipe has left: BrokenPipeError.
+    """
+
+    def __init__(self, raw: Any, strict: bool) -> None:
+        self._raw, self._strict = raw, strict
+
+    def writable(self) -> bool:
+        return True
+
+    def fileno(self) -> int:
+        return int(self._raw.fileno())
+
+    def isatty(self) -> bool:
+        return bool(self._raw.isatty())
+
+    def write(self, data: Any) -> int | None:
+        try:
+            written: int | None = self._raw.write(data)
+        except OSError as error:
+            if not self._strict:
+                return len(data)
+            if isinstance(error, BrokenPipeError):
+                raise
+            reason = f"the result cannot be written to stdout ({error.strerror})"
+            raise OutputError(f"{reason}; repeat the command with stdout open, or redirected elsewhere") from None
+        return written if self._strict or written is not None else len(data)
+
+
+def guard_streams() -> None:
+    """Make stdin, stdout and stderr usable, whether the caller has closed them, or filled what is behind them.
+
+    A descriptor that is closed is opened on the null device, for otherwise the next file, such as a database, would get
+    its number, and with it what is printed. stdout is opened to read, so that writing a result fails.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR if number == 2 else os.O_RDONLY), True)
+    sys.stdin = sys.stdin or open(0, encoding="utf-8", closefd=False)  # noqa: SIM115 (for the life of the process)
+    sys.stdout, sys.stderr = _guarded(sys.stdout, 1), _guarded(sys.stderr, 2)
+
+
+def discard_stdout() -> None:
+    """Let what is still in the buffer of stdout vanish, instead of failing again when the process ends."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _guarded(stream: Any, number: int) -> TextIO:
+    """Return the stream, or another on the same descriptor if it is None, above a _Stream."""
+    raw = io.FileIO(number, "w", closefd=False) if stream is None else getattr(stream.buffer, "raw", stream.buffer)
+    file = io.BufferedWriter(_Stream(raw, strict=number == 1))
+    encoding = "utf-8" if stream is None else stream.encoding
+    lines = number == 2 or bool(raw.isatty())
+    return io.TextIOWrapper(file, encoding=encoding, errors="backslashreplace", line_buffering=lines)

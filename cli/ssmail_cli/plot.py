@@ -12,7 +12,7 @@ from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
 from ssmail_cli.options import open_store, parse_statistic
-from ssmail_cli.output import note
+from ssmail_cli.output import note, say
 from ssmail_cli.report import draw_all
 from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics
 
@@ -111,7 +111,7 @@ class Destination:
 
         _print_notes(name, record)
         for path in save_figure(stem, record, figure, self.out, self.formats):
-            typer.echo(path)
+            say(path)
 
 
 app = typer.Typer(cls=FigureGroup, subcommand_metavar="NAME... [OPTIONS]", rich_markup_mode=None)
@@ -282,7 +282,7 @@ def film(ctx: typer.Context, run: OneRun) -> None:
 
     record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.FILM)
     _print_notes("film", record)
-    typer.echo(landscape_film.save_film(record, ctx.obj.out))
+    say(landscape_film.save_film(record, ctx.obj.out))
 
 
 @app.command(epilog=EPILOG)
@@ -301,7 +301,7 @@ def skeleton(
     if animate:
         path = ctx.obj.out / f"{record.stem}.gif"
         skeleton_plot.save_film(record, path)
-        typer.echo(path)
+        say(path)
 
 
 def _print_notes(name: str, record: "FigureRecord") -> None:

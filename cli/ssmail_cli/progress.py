@@ -5,7 +5,8 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from ssmail_cli.output import note, short
+from ssmail.errors import printable
+from ssmail_cli.output import note, progress_console, short
 from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def label(names: Mapping[str, Any]) -> str:
 @contextmanager
 def reporter(sweep: Sweep) -> Iterator[Report]:
     """Yield a function that shows each event of the training of these cells."""
-    labels = {cell: label(names) for cell, names in sweep.items()}
+    labels = {cell: printable(label(names)) for cell, names in sweep.items()}
     if not sys.stderr.isatty():
         yield _Log(labels)
         return
@@ -59,17 +60,16 @@ class _Log:
 
 
 def _progress() -> "Progress":
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=12),
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TextColumn("{task.fields[status]}", markup=False),
         TimeRemainingColumn(elapsed_when_finished=True),
     )
-    return Progress(*columns, console=Console(stderr=True), speed_estimate_period=120)
+    return Progress(*columns, console=progress_console(), speed_estimate_period=120)
 
 
 class _LinePerRun:
@@ -114,7 +114,7 @@ class _RunningRuns:
     def _end(self, event: "Event") -> None:
         """Replace the live line of the run by a line of text above."""
         self._ended += 1
-        self._progress.console.print(f"{self._labels[event.cell]}: {_headline(event)}", markup=False, highlight=False)
+        note(f"{self._labels[event.cell]}: {_headline(event)}")  # rich puts what is written to stderr above its lines
         if event.cell in self._tasks:
             self._progress.remove_task(self._tasks.pop(event.cell))
         self._subtract(event.epochs - (0 if event.kind == "skipped" else event.epoch))
@@ -148,7 +148,7 @@ def _headline(event: "Event") -> str:
         "skipped": f"skipped: {event.message}",
         "finished": f"finished{run}" + ("" if error is None else f": test error {error:.4g}"),
     }
-    return words.get(event.kind, f"{event.kind}{run}")
+    return printable(words.get(event.kind, f"{event.kind}{run}"))
 
 
 def _losses(event: "Event") -> str:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from ssmail.errors import ExitCode
+from ssmail.errors import ExitCode, command_line
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
-from ssmail_cli.output import error_line, note
+from ssmail_cli.output import error_line, note, say
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
@@ -33,7 +33,7 @@ def report(
     statistic = options.parse_statistic(stat)
     store = options.open_store(db)
     figures = draw_all(store, out, formats, profile, statistic)
-    command = f"ssmail report --db {db}" + (f" --profile {profile}" if profile else "")
+    command = command_line("ssmail", "report", "--db", db, *(("--profile", profile) if profile else ()))
     write_report(store, figures, out, command, profile)
     if any(drawn.lacks for drawn in figures):
         raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
@@ -54,7 +54,7 @@ def write_report(
 
     contents = gather(store, figures, judge(store, profile), command, unfinished)
     for path in write(contents, out.parent):
-        typer.echo(path)
+        say(path)
 
 
 def draw_all(
@@ -84,7 +84,7 @@ def draw_or_report(
     for remark in drawn.notes:
         note(f"{name}: {remark}")
     for path in drawn.files:
-        typer.echo(path)
+        say(path)
     return drawn
 
 

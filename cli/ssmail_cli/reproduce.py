@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, unknown_name
+from ssmail.errors import ExitCode, InputError, command_line, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import options
 from ssmail_cli.datasets import prep_mocap
 from ssmail_cli.options import Device, is_missing, parse_seeds
-from ssmail_cli.output import chosen_format, error_line, note, print_rows
+from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
 from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows, unfinished
@@ -78,7 +78,7 @@ def reproduce(
     data = _find_data(figures, cmu)
     if only is not None and set(data.missing) == set(figures):
         raise InputError(f"{next(iter(data.missing.values()))}.")
-    data.print()
+    data.tell()
     if dry_run:
         _print_plan(figures, data, db, jobs, as_json)
         return
@@ -88,11 +88,13 @@ def reproduce(
         _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
         for name, cells in figures.items()
     ]
-    command = f"ssmail reproduce --profile {profile} --seeds {seeds} --db {db}"
+    command = command_line("ssmail", "reproduce", "--profile", profile, "--seeds", seeds, "--db", db)
     failed = any(figure.lacks for figure in drawn if figure.name not in data.missing)
     if only is None:
         try:
             write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
+        except (BrokenPipeError, OutputError):
+            raise
         except Exception as error:  # the figures are drawn already
             note(f"the report is not written: {error_line(error)}")
             failed = True
@@ -142,7 +144,7 @@ class _Data(NamedTuple):
     made: dict[str, str]  # will be made before training
     missing: dict[str, str]
 
-    def print(self) -> None:
+    def tell(self) -> None:
         """Print a line on stderr for each file that will be made, and for each figure whose data is missing."""
         for sentence in dict.fromkeys(self.made.values()):
             note(sentence)
@@ -158,9 +160,10 @@ def _find_data(figures: Mapping[str, Sweep], cmu: Path | None) -> _Data:
             if environment != "mocap":
                 found.missing[name] = f"there is no {path}, which experiments.yaml names; make it, or correct data.path"
             elif cmu is None:
+                made = command_line("ssmail", "prep-mocap", "--source", "DIR", "--out", path)
                 found.missing[name] = (
-                    f"there is no {path}; `ssmail prep-mocap --source DIR --out {path}` makes it from files of the CMU "
-                    "database, and --download fetches those (or give --cmu-dir DIR)"
+                    f"there is no {path}; `{made}` makes it from files of the CMU database, and --download fetches "
+                    "those (or give --cmu-dir DIR)"
                 )
             elif not cmu.exists():
                 raise InputError(f"there is no {cmu}; --cmu-dir (or SSMAIL_CMU_DIR) names the folder or zip of 35.asf")

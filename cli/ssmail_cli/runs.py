@@ -7,10 +7,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError
+from ssmail.errors import ExitCode, InputError, printable
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
-from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, short, write_csv, write_json
+from ssmail_cli.output import (
+    Format,
+    chosen_format,
+    confirm,
+    note,
+    print_rows,
+    print_table,
+    say,
+    short,
+    write_csv,
+    write_json,
+)
 from ssmail_cli.run_table import environment_metrics, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
@@ -53,7 +64,7 @@ def list_runs(
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
-        note(f"no run in {db} meets these conditions")
+        note(f"no run in {store.where} meets these conditions")
     errors = list(dict.fromkeys(environment_metrics(run.environment).error for run in runs))
     rows = rows_with_metrics(store, runs, errors)
     kind = chosen_format(as_json, form)
@@ -113,7 +124,7 @@ def compare(
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
     if not runs:
-        note(f"no run in {db} meets these conditions")
+        note(f"no run in {store.where} meets these conditions")
     found = _compared(store, runs, metrics)
     for metric in metrics or ():
         if runs and not any(item.known for item in found if item.metric == metric):
@@ -178,7 +189,7 @@ def delete(
     if not yes:
         if not sys.stdin.isatty():
             raise InputError(f"deleting needs a confirmation; give --yes to delete {names}.")
-        if not typer.confirm(f"Delete {names}?", err=True):
+        if not confirm(f"Delete {names}?"):
             note("nothing deleted")
             raise typer.Exit(ExitCode.FAILURE)
     store.delete([run.id for run in runs])
@@ -234,7 +245,7 @@ def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] |
 
 
 def _headings(group: "list[Comparison]") -> dict[str, str]:
-    names = {item.metric: item.metric.replace("_constant_velocity", " constant\nvelocity") for item in group}
+    names = {item.metric: printable(item.metric).replace("_constant_velocity", " constant\nvelocity") for item in group}
     return {metric: name.replace("/", "/\n") for metric, name in names.items()}
 
 
@@ -253,17 +264,17 @@ def _print_comparisons(found: "list[Comparison]") -> None:
         for name in ("mean", "std", "median"):
             rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
         differs = "".join(f", {key}={short(value)}" for key, value in first.differs.items())
-        print(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
+        say(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
         print_table(rows, {"seed": "seed", **_headings(group)})
-        print()
-    between = ""
+        say("")
+    between: tuple[str, ...] = ()
     for environment, groups in groupby(specs, key=lambda group: group[0].environment):
         alike = list(groups)
         if len(alike) > 1:
-            print(f"{between}{environment}: mean ± standard deviation; seeds: with the first metric, of all")
+            say(*between, f"{environment}: mean ± standard deviation; seeds: with the first metric, of all")
             columns = {"spec": "spec", "seeds": "seeds", **_headings(alike[0])}
             print_table([_overview_row(group) for group in alike], columns)
-            between = "\n"
+            between = ("",)
 
 
 def _overview_row(group: "list[Comparison]") -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, SsmailError
+from ssmail.errors import ExitCode, InputError, SsmailError, sentence
 from ssmail.execution import Resume
 from ssmail_cli.options import is_missing
 from ssmail_cli.output import chosen_format, error_line, note, print_rows
@@ -79,7 +79,7 @@ def is_interrupted(rows: Rows) -> bool:
 def unfinished(sweep: Sweep, rows: Rows) -> list[str]:
     """Return a line for each run that did not finish."""
     return [
-        f"{label(names)} {row['outcome']}: {row['message']}"
+        sentence(f"{label(names)} {row['outcome']}: {row['message']}")
         for names, row in zip(sweep.values(), rows, strict=True)
         if row["state"] != "finished"
     ]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
@@ -142,9 +142,10 @@ def _point_to_figures(name: str, environment: str | None, db: str) -> None:
     from ssmail.config.experiments_file import load_experiments
 
     trained = ablation(name, environment).environment
-    database = "" if db == options.DEFAULT_DATABASE else f" --db {db}"
+    database = () if db == options.DEFAULT_DATABASE else ("--db", db)
     for figure in load_experiments().figures:
         needed = figure_requirements(figure)
         own = needed.environment == trained
         if figure in FIGURES and needed.ablation == name and (own or FIGURES[figure].has_environment):
-            note(f"`ssmail plot {figure}{'' if own else f' --env {trained}'}{database}` draws these runs")
+            where = () if own else ("--env", trained)
+            note(f"`{command_line('ssmail', 'plot', figure, *where, *database)}` draws these runs")

@@ -1,8 +1,26 @@
-"""Errors that ssmail raises deliberately. Each message is one sentence that names the cause and the remedy."""
+"""Errors that ssmail raises deliberately, and how text from elsewhere is put into what ssmail says.
+
+Each message is one sentence that names the cause and the remedy.
+"""
 
 import difflib
+import re
+import shlex
 from collections.abc import Iterable
 from enum import IntEnum
+
+LONGEST = 300
+"""Characters of a message."""
+_NAME = 60  # characters of a name in a message
+_CHOICES = 160  # characters of a list of names
+_WORD = 200  # characters of a word in a suggested command
+# Characters that Python counts as printable and that take no room, or look like a space.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
+_CREDENTIALS = re.compile(r"(://[^\s:/?#@]*):.*(@|%40)")
+_LONG_COMMAND = re.compile(r"`[^`]{60,}`")
+_QUERY = re.compile(r"(?<=://)([^\s?]*\?)(\S*)")
 
 
 class ExitCode(IntEnum):
@@ -27,13 +45,69 @@ class InputError(SsmailError):
     exit_code = ExitCode.BAD_INPUT
 
 
+def printable(text: object) -> str:
+    """Return the text with escapes, such as \\x1b or \\u202e, for all characters that a terminal does not just show.
+
+    These are control characters (a newline is one), controls of the direction of writing, lone surrogates, and all that
+    is invisible or a space other than " ". So the text is one line, and looks like what it is.
+    """
+    words = str(text)
+    if words.isprintable() and not _INVISIBLE.search(words):
+        return words
+    return "".join(map(_shown, words))
+
+
+def _shown(character: str) -> str:
+    if character.isprintable() and not _INVISIBLE.match(character):
+        return character
+    return character.encode("unicode_escape").decode("ascii")
+
+
+def masked(text: str) -> str:
+    """Return the text with *** for the password of a URL in it, and for the values in the URL's query."""
+    if "://" not in text:
+        return text
+    hidden = _CREDENTIALS.sub(r"\1:***@", text)
+    return _QUERY.sub(lambda found: found[1] + re.sub(r"=[^&]*", "=***", found[2]), hidden)
+
+
+def shortened(text: str, length: int) -> str:
+    """Return the text, without its middle if it has more than `length` characters."""
+    if len(text) <= length:
+        return text
+    end = (length - 5) // 2
+    return f"{text[: length - 5 - end]} ... {text[len(text) - end :]}"
+
+
+def sentence(text: str) -> str:
+    """Return the text as a message of one line: printable, without passwords, and of at most LONGEST characters.
+
+    A long command is left out of a text that is too long: without its middle it could be another command.
+    """
+    line = printable(" ".join(masked(text).split()))
+    return shortened(line if len(line) <= LONGEST else _LONG_COMMAND.sub("`...`", line), LONGEST)
+
+
+def command_line(*words: object) -> str:
+    """Return a command to suggest, with its words quoted for a POSIX shell and without passwords.
+
+    A word that is not printable, has a backtick or is very long is not shown: three dots take its place.
+    """
+    return shlex.join(map(_word, words))
+
+
+def _word(word: object) -> str:
+    text = masked(str(word))
+    return text if printable(text) == text and "`" not in text and len(text) <= _WORD else "..."
+
+
 def suggestion(name: str, choices: Iterable[str]) -> str:
     """The end of a message about an unknown name: the closest of `choices`, or all of them if none is close."""
-    choices = list(choices)
-    close = difflib.get_close_matches(name, choices, n=1)
-    return f"did you mean {close[0]}?" if close else f"choose from {', '.join(choices)}."
+    choices = [shortened(choice, _NAME) for choice in choices]
+    close = difflib.get_close_matches(name[:_NAME], choices, n=1)
+    return f"did you mean {close[0]}?" if close else f"choose from {shortened(', '.join(choices), _CHOICES)}."
 
 
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
     """An InputError for a misspelt name, with a suggestion from `choices`."""
-    return InputError(f"unknown {kind} '{name}'; {suggestion(name, choices)}")
+    return InputError(f"unknown {kind} '{shortened(name, _NAME)}'; {suggestion(name, choices)}")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import resource
+import signal
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -124,6 +126,30 @@ def test_bad_input(
 def test_an_unwritable_place(cli: CommandLine, folder: Path) -> None:
     outcome = cli("prep-mocap", "--source", folder, "--out", "/proc/none/set.npz", *SMALL)
     assert outcome.sentence.startswith("cannot write /proc/none/set.npz")
+
+
+def test_what_a_killed_one_left_behind_is_gone_after_the_next(cli: CommandLine, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out" / "set.npz"
+    child = os.fork()
+    if child == 0:
+        Path.replace = lambda *_: os.kill(os.getpid(), signal.SIGKILL)  # type: ignore[method-assign, assignment]
+        cli("prep-mocap", "--source", folder, "--out", out, *SMALL)
+    assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    assert [path.name.startswith(".set.npz.") for path in out.parent.iterdir()] == [True]
+    assert cli("prep-mocap", "--source", folder, "--out", out, *SMALL).code == 0
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_a_full_disk(cli: CommandLine, folder: Path, tmp_path: Path) -> None:
+    """Which has room for 10 kB."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        outcome = cli("prep-mocap", "--source", folder, "--out", tmp_path / "out" / "set.npz", *SMALL)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert outcome.sentence == f"cannot write {tmp_path}/out/set.npz: File too large; choose a writable --out"
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_downloaded_files_are_a_source(

@@ -1,6 +1,7 @@
 """experiments.yaml -> specs: the order of the layers, and one sentence for everything a user can get wrong."""
 
 import contextlib
+import os
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssmail.config import strict_yaml
 from ssmail.config.experiments import FigureRequirements, ablation, build_spec, figure_requirements
 from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE, load_experiments
 from ssmail.config.spec import RunSpec
@@ -246,3 +248,28 @@ def test_a_figure_names_its_runs() -> None:
     assert figure_requirements("fig2") == FigureRequirements("letters", ("ssail",), "alpha")
     with pytest.raises(InputError, match=r"unknown figure 'figg5'; did you mean fig5\?"):
         figure_requirements("figg5")
+
+
+def test_a_file_is_parsed_once_until_its_content_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed = []
+    parse = strict_yaml.parse_bytes
+
+    def counting(content: bytes, path: Path) -> Any:
+        parsed.append(path)
+        return parse(content, path)
+
+    monkeypatch.setattr(strict_yaml, "parse_bytes", counting)
+    file = write(tmp_path / "e.yaml")
+    for _ in range(3):
+        assert figure_requirements("fig4", file).environment == "yjunction"
+        assert build_spec("ssail", "yjunction", "smoke", (), file).sac.gamma != 0.5
+    assert parsed == [file]
+    times = file.stat()
+    content = file.read_text()
+    before = f"gamma: {SHIPPED.defaults['sac']['gamma']}"
+    assert content.count(before) == 1
+    file.write_text(content.replace(before, "gamma: 0.50"))  # as long as before
+    os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert file.stat().st_size == times.st_size
+    assert build_spec("ssail", "yjunction", "smoke", (), file).sac.gamma == 0.5
+    assert parsed == [file, file]

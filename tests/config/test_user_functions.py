@@ -1,15 +1,16 @@
 """A user's own function: where it is found, what it is known by, and every way in which it cannot be loaded."""
 
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
 from ssmail.config.experiments import ablation, ablation_specs, build_spec
-from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
+from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE, PACKAGE
 from ssmail.config.sections import required
 from ssmail.config.spec import RunSpec
-from ssmail.config.user_functions import UserFunction
+from ssmail.config.user_functions import MOST_BYTES, UserFunction, load_label, search_folders
 from ssmail.errors import InputError
 
 from .experiments_file import write
@@ -37,7 +38,7 @@ def test_other_texts_name_no_function(text: object) -> None:
     assert UserFunction.parse(text) is None
 
 
-def test_the_first_folder_wins_and_installed_packages_come_last(tmp_path: Path) -> None:
+def test_the_first_folder_wins(tmp_path: Path) -> None:
     first, second = tmp_path / "1", tmp_path / "2"
     for folder in (first, second):
         (folder / "nested").mkdir(parents=True)
@@ -48,8 +49,46 @@ def test_the_first_folder_wins_and_installed_packages_come_last(tmp_path: Path) 
     assert loaded("own:f", first, second) == 1
     assert loaded("own:f", second, first) == 2
     assert loaded("nested.deep:f", first, second) == 7
-    assert loaded("keyword:iskeyword", first) is False
     assert "own" not in sys.modules
+
+
+@pytest.mark.parametrize("text", ["keyword:iskeyword", "os.path:join", "trap.inside:f", "trap:f", "math:sin"])
+def test_nothing_is_taken_from_the_installed_packages(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    (tmp_path / "installed" / "trap").mkdir(parents=True)
+    for name in ("__init__", "inside"):
+        (tmp_path / "installed" / "trap" / f"{name}.py").write_text("def f(x):\n    return x\n")
+    monkeypatch.syspath_prepend(tmp_path / "installed")
+    file = f"{text.partition(':')[0].replace('.', '/')}.py"
+    assert complaint(text, tmp_path) == f"{text}: there is no {file} in {tmp_path}; put it beside experiments.yaml."
+    with pytest.raises(InputError, match="there is no "):
+        named(text).with_digest([tmp_path])
+    assert "trap" not in sys.modules
+
+
+def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
+    inside, outside = tmp_path / "in", tmp_path / "out"
+    inside.mkdir()
+    (outside / "package").mkdir(parents=True)
+    for file in (outside / "away.py", outside / "package" / "deep.py", inside / "here.py"):
+        file.write_text("def f(x):\n    return 3\n")
+    (inside / "link.py").symlink_to(outside / "away.py")
+    (inside / "package").symlink_to(outside / "package")
+    (inside / "near.py").symlink_to("here.py")
+    assert loaded("near:f", inside) == 3
+    for name in ("link:f", "package.deep:f"):
+        assert "is a link out of its folder; copy the file there instead." in complaint(name, inside)
+
+
+def test_a_pipe_a_folder_and_a_huge_file_are_no_modules(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.py")
+    (tmp_path / "folder.py").mkdir()
+    (tmp_path / "huge.py").write_text("#" * (MOST_BYTES + 1))
+    assert "there is no pipe.py" in complaint("pipe:f", tmp_path)
+    assert "there is no folder.py" in complaint("folder:f", tmp_path)
+    assert "huge.py has more than 1,000,000 bytes" in complaint("huge:f", tmp_path)
+    assert "there is no aaa" in complaint(f"{300 * 'a'}:f", tmp_path)
 
 
 def test_a_changed_file_is_another_function_however_fast_it_changed(tmp_path: Path) -> None:
@@ -86,10 +125,8 @@ def test_a_file_that_cannot_be_used(tmp_path: Path, name: str, content: str, sai
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
-    expected = f"there is no module a.b in {tmp_path}, nor is it installed; put a/b.py beside experiments.yaml."
+    expected = f"there is no a/b.py in {tmp_path}; put it beside experiments.yaml."
     assert complaint("a.b:f", tmp_path) == f"a.b:f: {expected}"
-    assert "there is no module os.path.nothing in" in complaint("os.path.nothing:f", tmp_path)
-    assert complaint("math:sin", tmp_path) == "math:sin: math is not a Python file; name a function in one."
 
 
 # -- in a spec -----------------------------------------------------------------------------------------------------
@@ -123,10 +160,31 @@ def test_a_changed_file_is_another_spec(home: Path) -> None:
     with pytest.raises(InputError, match=r"own\.py has changed"):
         spec(label)
     (home / "own.py").unlink()
-    with pytest.raises(InputError, match=r"own:f: there is no module own in .*/home or .*/elsewhere, nor is it"):
+    with pytest.raises(InputError, match=r"own:f: there is no own\.py in .*/home or .*/elsewhere; put"):
         spec()
     (Path.cwd() / "own.py").write_text("def f(alpha):\n    return alpha\n")
     assert spec() == before  # found in the current folder
+
+
+def test_training_needs_the_digest_of_the_spec(home: Path) -> None:
+    with pytest.raises(InputError, match=r"own:f names no digest"):
+        load_label("own:f")
+    with pytest.raises(InputError, match=r"own\.py has changed"):
+        load_label("own:f@000000000000")
+    assert load_label(named("own:f").with_digest([home])) is not None
+
+
+def test_no_function_is_searched_for_in_ssmail_itself(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shipped experiments.yaml of an installation lies beside its modules."""
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(write(home / "mine.yaml")))
+    assert search_folders() == (home, Path.cwd())
+    assert search_folders(PACKAGE / "experiments.yaml") == (Path.cwd(),)
+
+
+def test_a_removed_working_folder_is_one_sentence(home: Path) -> None:
+    Path.cwd().rmdir()
+    with pytest.raises(InputError, match="the current folder has been removed"):
+        search_folders()
 
 
 def test_values_of_an_ablation_may_be_words_knots_and_functions(home: Path) -> None:
@@ -139,5 +197,5 @@ def test_values_of_an_ablation_may_be_words_knots_and_functions(home: Path) -> N
     assert ablation("mine", file=file).values == tuple(specs)
     (home / "own.py").unlink()
     assert ablation("mine", file=file).values[1] == "own:f"  # its runs can still be drawn
-    with pytest.raises(InputError, match="there is no module own"):
+    with pytest.raises(InputError, match=r"there is no own\.py"):
         ablation_specs("mine", "smoke", file=file)

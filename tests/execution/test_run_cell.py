@@ -188,6 +188,18 @@ def test_a_crash_is_kept_with_its_traceback_and_can_be_resumed(store: Store, cel
     assert (row.state, row.error) == (RunState.FINISHED, None)
 
 
+def test_a_stored_error_shows_no_password(store: Store, cells: list[Cell], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise ConnectionError("postgresql://me:secret@host/name is gone")
+
+    monkeypatch.setattr(Walk, "run_epoch", fail)
+    event = run(cells[0], store)[-1]
+    (row,) = store.runs()
+    assert event.message == "ConnectionError: postgresql://me:***@host/name is gone"
+    assert "me:***@host" in str(row.error)
+    assert "secret" not in str(row.error)
+
+
 def test_divergence_ends_a_run_without_final_evaluation(store: Store, cells: list[Cell]) -> None:
     event = run(cells[0], store, loop=Diverges)[-1]
     assert (event.kind, event.epoch, event.message) == ("diverged", 2, "weights became NaN or infinite in epoch 3")
@@ -288,8 +300,9 @@ def test_the_record_of_a_checkpoint_names_no_file_elsewhere(store: Store, cells:
         connection.execute("UPDATE artifact SET path = ?", (str(tmp_path / "elsewhere" / "secret.pt"),))
     connection.close()
     save_checkpoint(tmp_path / "elsewhere" / "secret.pt", {})
-    (event, *_) = run(cells[0], store)
-    assert (event.kind, event.epoch) == ("resumed", 0)  # its own last.pt does not exist
+    (event,) = run(cells[0], store)
+    assert event.bad_input
+    assert "has its checkpoint recorded in another folder; start afresh" in event.message
 
 
 def test_a_run_that_has_ended_leaves_only_what_it_recorded(store: Store, cells: list[Cell]) -> None:

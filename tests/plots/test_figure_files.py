@@ -154,7 +154,9 @@ def test_what_cannot_be_read_is_said(filled: Store, tmp_path: Path) -> None:
         figure.savefig(foreign)  # without metadata
         broken.write_bytes(b"nothing of the kind")
         for path in (foreign, broken):
-            with pytest.raises(InputError, match=f"^{path} (carries no run ids of ssmail|is not a PNG image); "):
+            with pytest.raises(
+                InputError, match=f"^{path} (carries no run ids of ssmail|is not a whole {format.upper()} image); "
+            ):
                 provenance.read(path)
         with pytest.raises(InputError, match="cannot be read: No such file"):
             provenance.read(tmp_path / f"missing.{format}")

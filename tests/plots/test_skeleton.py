@@ -163,3 +163,19 @@ def test_what_cannot_be_drawn_is_said(data: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match=r"file cannot be written: .*; choose another folder\.$"):
         skeleton.save_film(skeleton.collect(data), tmp_path / "file" / "walk.gif")
+
+
+def test_a_skeleton_out_of_proportion_is_not_drawn(data: Path) -> None:
+    """It would have millions of ticks or pixels."""
+    experts = expert_sets.load(data)
+    splits = {}
+    for split in SIZES:
+        old = getattr(experts, split)
+        splits[split] = Trajectories.single_mode(old.positions * 1000, old.velocities * 1000, old.trial, old.frame)
+    whole = (experts.centre_lines, experts.parameters, experts.joints, experts.parents, experts.sources)
+    record = skeleton.collect(data)
+    expert_sets.save(ExpertSet.bundle(splits, *whole), data, force=True)
+    with pytest.raises(InputError, match=r"test window 0 of .*mocap\.npz spans 5e\+03 units, too far to draw"):
+        skeleton.collect(data)
+    with pytest.raises(InputError, match="test window 0 is too tall for its width; choose another"):
+        skeleton.draw(replace(record, places=record.places * [0.01, 300.0]))

@@ -1,5 +1,8 @@
 """`ssmail plot training`: how runs are grouped and never mixed, unknown names, divergence, and what is drawn."""
 
+import sqlite3
+import xml.etree.ElementTree as ElementTree
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from ssmail.errors import InputError
+from ssmail.errors import InputError, printable
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import provenance
 from ssmail.plots.saving import save_figure
@@ -151,3 +154,21 @@ def test_many_groups_have_legible_legends_beside_the_curves(store: Store, add_ru
     assert axes.get_window_extent().height > 80
     means = [line for line in axes.lines if str(line.get_gid()).startswith("centre")]
     assert len({line.get_color() for line in means}) == 8
+
+
+@pytest.mark.parametrize(
+    "method", ["$x$", "$\\nosuch{$", "a $ b $ c", "_hidden", "two\nlines\x1b[2J\u202e", "<b>&]]>-->", "x" * 5000]
+)
+def test_a_stored_method_is_drawn_as_it_is(method: str, store: Store, add_run: Any, tmp_path: Path) -> None:
+    """Neither as mathematics, which may not parse, nor left out of the legend; the files stay readable."""
+    add_run(0)
+    with closing(sqlite3.connect(store.where)) as connection, connection:
+        connection.execute("UPDATE run SET method = ?1, spec_json = json_set(spec_json, '$.method', ?1)", (method,))
+    record = collect(store, store.runs(), [ERROR])
+    figure = draw(record)
+    (text, *_) = (item.get_text() for item in figure.legends[0].get_texts())
+    assert text.lstrip().replace(r"\$", "$").startswith(printable(method)[:40])
+    svg, csv = save_figure(record.stem, record, figure, tmp_path, ["svg"])
+    ElementTree.parse(svg)
+    assert all(character.isprintable() or character == "\n" for character in csv.read_text())
+    assert printable(method).replace('"', '""') in csv.read_text()

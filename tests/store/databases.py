@@ -43,7 +43,7 @@ def add(
         writer.arrays({"test/rollouts": np.arange(4.0) + seed})
     if state in (RunState.FINISHED, RunState.DIVERGED):
         for name in checkpoints:
-            writer.artifact(name, folder / name)
+            writer.artifact(name)
     if state is not RunState.RUNNING:
         writer.finish(state, None if state is RunState.FINISHED else f"it {state}")
     return writer.run_id

@@ -13,7 +13,7 @@ from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from sqlalchemy import create_engine, event
+from sqlalchemy import create_engine, event, make_url
 
 import ssmail.store
 from ssmail.config.spec import RunSpec
@@ -166,6 +166,31 @@ def test_a_password_is_not_shown() -> None:
     with pytest.raises(InputError, match=r"nosuch://me:\*\*\*@host") as caught:
         Store.open("nosuch://me:secret@host/name")
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "nosuch://me:secret@host/name",
+        "nosuch://host/name?password=secret",
+        "nosuch://host/name?p%61ssword=secret&user=me",
+        "nosuch://me:sec@secret/@host/name",
+        "postgresql://me:secret@host:port/name",
+        "postgresql://me:secret@host:99999999/name?sslpassword=secret",
+        "://me:secret@host",
+        "sqlite://me:secret@host/",
+    ],
+)
+def test_no_form_of_a_url_shows_a_password(url: str) -> None:
+    with pytest.raises(InputError) as caught:
+        Store.open(url)
+    assert "secret" not in str(caught.value)
+
+
+def test_a_store_on_a_server_is_named_without_its_password() -> None:
+    for url in ("postgresql://me:secret@host/name", "postgresql://host/name?user=me&password=secret"):
+        assert "secret" not in connection.name_of(make_url(url))
+        assert "host" in connection.name_of(make_url(url))
 
 
 def test_a_read_only_database_can_be_read_but_not_written(store: Store, spec: RunSpec) -> None:

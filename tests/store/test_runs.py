@@ -6,7 +6,6 @@ import sqlite3
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -93,7 +92,7 @@ WRITES: dict[str, Callable[[RunWriter], None]] = {
     "final": lambda writer: writer.final(9, {"a": 1.0}),
     "heartbeat": lambda writer: writer.heartbeat(),
     "arrays": lambda writer: writer.arrays({"x": np.zeros(1)}),
-    "artifact": lambda writer: writer.artifact("x", Path(__file__)),
+    "artifact": lambda writer: writer.artifact("best.pt"),
     "finish": lambda writer: writer.finish(RunState.FAILED),
 }
 
@@ -105,6 +104,8 @@ def test_a_run_that_ended_cannot_be_written(
 ) -> None:
     write_to_running = WRITES["epoch"]
     write_to_running(writer)  # negative control: the very same call works while the run is running
+    writer.folder.mkdir(parents=True)
+    (writer.folder / "best.pt").touch()
     writer.finish(state, "why")
     before, recorded = only(store), values(store, writer.run_id)
     with pytest.raises(SsmailError, match=f"is {state} and can no longer be written"):
@@ -293,7 +294,7 @@ def test_delete_removes_rows_and_checkpoints_of_those_runs_only(store: Store, sp
         file.write_bytes(b"abc")
         writer.epoch(1, {"a": 1.0})
         writer.arrays({"x": np.zeros(2)})
-        writer.artifact("last.pt", file)
+        writer.artifact("last.pt")
         writer.finish(RunState.FINISHED)
     gone, kept = (writer.run_id for writer in writers)
     with pytest.raises(InputError, match="no run id starts with"):

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import yaml
 from pydantic import ValidationError
+from yaml.constructor import ConstructorError
 
 from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
@@ -27,9 +28,10 @@ from ssmail.config.spec import (
     required_sections,
 )
 from ssmail.config.user_functions import UserFunction, search_folders
-from ssmail.errors import InputError, suggestion
+from ssmail.errors import InputError, shortened, suggestion
 
 _LABEL = "self_supervision.label"
+_SHOWN = 80  # characters of an argument in a message
 
 
 class Ablation(NamedTuple):
@@ -112,7 +114,11 @@ def figure_requirements(name: str, file: Path | None = None) -> FigureRequiremen
     experiments = load_experiments(file)
     entry = experiments.entry("figure", name)
     source = f"figures.{name} of {experiments.path.name}"
-    if "environment" not in entry or ("methods" in entry) == ("ablation" in entry):
+    texts = [
+        entry.get("environment"),
+        *(entry["methods"] if _is_list(entry.get("methods")) else [entry.get("ablation")]),
+    ]
+    if not all(isinstance(text, str) for text in texts) or ("methods" in entry) == ("ablation" in entry):
         raise InputError(f"{source} needs an environment, and either methods or an ablation; correct it.")
     if "methods" in entry:
         return FigureRequirements(entry["environment"], tuple(entry["methods"]))
@@ -160,7 +166,8 @@ def _read_ablation(experiments: Experiments, name: str, environment: str | None)
     needed = Ablation._fields[1:]
     for key in entry:
         if key not in (*needed, "settings"):
-            raise InputError(f"unknown key '{key}' in {source}; {suggestion(str(key), (*needed, 'settings'))}")
+            known = (*needed, "settings")
+            raise InputError(f"unknown key '{shortened(key, _SHOWN)}' in {source}; {suggestion(key, known)}")
     for key in needed:
         if not isinstance(entry.get(key), list if key == "values" else str) or not entry[key]:
             raise InputError(f"{source} needs {key} ({'a list' if key == 'values' else 'text'}); add it.")
@@ -172,7 +179,12 @@ def _read_ablation(experiments: Experiments, name: str, environment: str | None)
         with suppress(InputError):  # stored runs can be drawn without the files of their functions
             folders = search_folders(experiments.path)
             values = [found.with_digest(folders) if (found := UserFunction.parse(value)) else value for value in values]
-    return Ablation(name, entry["method"], environment, entry["key"], to_tuples(values))
+    values = to_tuples(values)
+    try:
+        hash(values)
+    except TypeError:
+        raise InputError(f"a mapping is no value of {source}; list numbers, texts or lists.") from None
+    return Ablation(name, entry["method"], environment, entry["key"], values)
 
 
 def _override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[Layer]:
@@ -180,13 +192,15 @@ def _override_layers(overrides: Sequence[str], method: str, environment: str, so
     layers = []
     for text in overrides:
         key, equals, value = text.partition("=")
-        key = key.strip()
+        key, shown = key.strip(), shortened(text, _SHOWN)
         if not equals or not all(key.split(".")):
-            raise InputError(f"--set takes key.path=value, not '{text}'; for example --set sac.gamma=0.9.")
+            raise InputError(f"--set takes key.path=value, not '{shown}'; for example --set sac.gamma=0.9.")
         try:
             layers.append(Layer(source, _nested(key, strict_yaml.parse(value))))
+        except ConstructorError as error:
+            raise InputError(f"{source} {shown} cannot be used: {error.problem}.") from None
         except yaml.YAMLError:
-            raise InputError(f"the value of --set {text} is not valid YAML; put quotes around text.") from None
+            raise InputError(f"the value of {source} {shown} is not valid YAML; put quotes around text.") from None
     for layer in layers:
         for key in flatten(layer.values):
             check_section(key, method, environment, source)
@@ -194,6 +208,14 @@ def _override_layers(overrides: Sequence[str], method: str, environment: str, so
 
 
 def _nested(key: str, value: Any) -> dict[str, Any]:
-    """Return a dotted key as nested mappings: ("a.b", 0.5) -> {"a": {"b": 0.5}}."""
-    first, _, rest = key.partition(".")
-    return {first: _nested(rest, value) if rest else value}
+    """Return a dotted key as nested mappings: ("a.b", 0.5) -> {"a": {"b": 0.5}}. Raises InputError for endless ones."""
+    first, *rest = key.split(".")
+    if len(rest) > strict_yaml.DEEPEST:
+        raise InputError(f"unknown key '{shortened(key, _SHOWN)}'; keys look like sac.gamma.")
+    for part in reversed(rest):
+        value = {part: value}
+    return {first: value}
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list) and bool(value)

@@ -6,6 +6,7 @@ A spec is merged from LAYERS, and later ones win. Each layer is a path in the fi
 ablation add ABLATION_LAYERS. Overrides (--set) come last. A path that the file does not have is an empty layer.
 """
 
+import functools
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssmail.config import strict_yaml
-from ssmail.errors import InputError, suggestion, unknown_name
+from ssmail.errors import InputError, shortened, suggestion, unknown_name
 
 LAYERS = (
     "defaults",
@@ -29,6 +30,8 @@ LAYERS = (
 ABLATION_LAYERS = ("ablations.{ablation}.settings", "profiles.{profile}.ablations.{ablation}")
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
 _FILE_NAME = "experiments.yaml"
+PACKAGE = Path(__file__).resolve().parents[1]
+"""The folder of ssmail itself, where an installation has its experiments.yaml."""
 Mappings = Mapping[str, Mapping[str, Any]]
 
 
@@ -85,16 +88,22 @@ class Experiments:
 def load_experiments(file: Path | None = None) -> Experiments:
     """Read an experiments.yaml: `file`, or the one that `find_file` returns.
 
-    Raises InputError for a file that is missing, is not YAML (with the line), or lacks a section of Experiments.
+    Unless its content has changed, a file is parsed once in the life of the process. Raises InputError for a file that
+    is missing, is not YAML (with the line), or lacks a section of Experiments.
     """
     path = file or find_file()
-    content = strict_yaml.read(path)
+    return _parsed(path, strict_yaml.read_bytes(path, strict_yaml.MOST_BYTES))
+
+
+@functools.lru_cache(maxsize=4)
+def _parsed(path: Path, source: bytes) -> Experiments:
+    content = strict_yaml.parse_bytes(source, path)
     sections = [field.name for field in fields(Experiments) if field.name != "path"]
     if not isinstance(content, dict):
         raise InputError(f"{path} contains no mapping; it needs the sections {', '.join(sections)}.")
     for name in content:
         if name not in sections:
-            raise InputError(f"unknown section '{name}' in {path}; {suggestion(str(name), sections)}")
+            raise InputError(f"unknown section '{shortened(name, 60)}' in {path}; {suggestion(name, sections)}")
     for name in sections:
         if not isinstance(content.get(name), dict):
             raise InputError(f"section '{name}' of {path} is missing or no mapping; compare with the shipped one.")
@@ -105,8 +114,7 @@ def find_file() -> Path:
     """Return the path in $SSMAIL_EXPERIMENTS, or the file shipped with the package, or that of the checkout."""
     if os.environ.get(ENVIRONMENT_VARIABLE):
         return Path(os.environ[ENVIRONMENT_VARIABLE])
-    package = Path(__file__).parents[1]
-    packaged, checkout = package / _FILE_NAME, package.parents[1] / _FILE_NAME
+    packaged, checkout = PACKAGE / _FILE_NAME, PACKAGE.parents[1] / _FILE_NAME
     return packaged if packaged.exists() else checkout
 
 

@@ -3,16 +3,17 @@
 No field has a default here. All defaults are in experiments.yaml (see ssmail.config.experiments_file).
 """
 
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ssmail.config.shaping import AlphaDensity, AlphaPiece, Label
 
-Count = Annotated[int, Field(ge=1)]
-NonNegativeCount = Annotated[int, Field(ge=0)]
+Count = Annotated[int, Field(ge=1, le=10**9)]
+NonNegativeCount = Annotated[int, Field(ge=0, lt=2**63)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Jitter = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -35,6 +36,18 @@ def required(section: Section | None) -> Section:
     return section
 
 
+MOST_STATES = 10**7  # of all agents in an expert set that a generator makes; 320 MB
+
+
+def _check_size(data: "YJunctionSpec | LettersSpec", agents: int) -> None:
+    """Raise ValueError for an expert set that is too large to be generated."""
+    states = (data.train + data.validation + data.test) * data.steps * agents
+    if states > MOST_STATES:
+        raise ValueError(
+            f"{states} states in all trajectories are more than {MOST_STATES}; lower train, validation, test or steps"
+        )
+
+
 class YJunctionSpec(Frozen):
     """Geometry and size of the Y-Junction expert set (sections 4.1 and B.2).
 
@@ -47,8 +60,13 @@ class YJunctionSpec(Frozen):
     agents: Count
     steps: Annotated[int, Field(ge=3)]
     lane_angle: Annotated[float, Field(gt=0, lt=90)]  # degrees between the street and each lane
-    jitter: NonNegative  # scale of the random starts, gaps, speeds and lateral offsets; 1 is the default
+    jitter: Jitter  # scale of the random starts, gaps, speeds and lateral offsets; 1 is the default
     seed: NonNegativeCount
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_size(self, self.agents)
+        return self
 
 
 MOST_LETTERS = 6
@@ -72,8 +90,13 @@ class LettersSpec(Frozen):
     validation: Count
     test: Count
     steps: Annotated[int, Field(ge=20)]
-    jitter: NonNegative  # scale of the random starts, shapes, wobble and tempo; 1 is the default
+    jitter: Jitter  # scale of the random starts, shapes, wobble and tempo; 1 is the default
     seed: NonNegativeCount
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_size(self, len(self.word))
+        return self
 
 
 class DataSpec(Frozen):

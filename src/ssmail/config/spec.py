@@ -14,7 +14,7 @@ from typing import Any, Literal, Self, get_args
 from pydantic import BaseModel, ValidationError, model_validator
 
 from ssmail.config import sections, strict_yaml
-from ssmail.errors import InputError
+from ssmail.errors import InputError, shortened
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
 METHODS: tuple[str, ...] = get_args(Method)
@@ -145,7 +145,7 @@ def check_keys(given: Mapping[str, Any], source: str) -> None:
         if key in _ARGUMENTS:
             raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
         if key not in is_section:
-            raise InputError(f"unknown key '{key}' in {source}; {_suggest_key(key, is_section)}")
+            raise InputError(f"unknown key '{shortened(key, 60)}' in {source}; {_suggest_key(key, is_section)}")
         if is_section[key] and not isinstance(value, Mapping):
             first = next(other for other in is_section if other.startswith(f"{key}."))
             what = f"{key} = {strict_yaml.inline(value)} in {source}"
@@ -210,7 +210,7 @@ def _suggest_key(key: str, sections: Mapping[str, bool]) -> str:
     if close:
         return f"did you mean {close[0]}?"
     choices = siblings.values() or [name for name in sections if "." not in name]
-    return f"choose from {', '.join(choices)}."
+    return f"choose from {shortened(', '.join(choices), 160)}."
 
 
 def _without_nulls(values: Mapping[str, Any]) -> dict[str, Any]:

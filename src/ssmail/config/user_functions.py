@@ -1,8 +1,12 @@
 """Python functions of the user, named in a spec as "module:function": how they are found, identified and loaded.
 
-A module is searched for next to the experiments.yaml in use, in the current folder, and among the installed packages.
-A spec that is built from experiments.yaml holds "module:function@digest", with the first 12 digits of the SHA-256 of
-the module's file: a run belongs to the function as it was. The digest does not cover what that file imports.
+A module is a file in one of the user's own folders: beside the experiments.yaml in use, or in the current folder.
+Installed packages are not searched. A spec that is built from experiments.yaml holds "module:function@digest", with the
+first 12 digits of the SHA-256 of the module's file: a run belongs to the function as it was. The digest does not cover
+what that file imports.
+
+Only training executes such a file (`load_label`), and only with the digest of the spec that it trains. Everything else,
+such as drawing a stored run, takes the name as text, or compares the digest.
 """
 
 import hashlib
@@ -14,12 +18,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
-from ssmail.config.experiments_file import find_file
+from ssmail.config import strict_yaml
+from ssmail.config.experiments_file import PACKAGE, find_file
 from ssmail.config.shaping import FUNCTION
 from ssmail.errors import InputError, suggestion
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+MOST_BYTES = 1_000_000  # of a file with a function
+_LONGEST_REASON = 120  # characters of an exception in a message
 
 
 @dataclass(frozen=True)
@@ -63,30 +71,22 @@ class UserFunction:
         return cast("Callable[..., Any]", function)
 
     def _locate(self, folders: Sequence[Path]) -> Path:
+        """Return the file of the module. Looking for it imports nothing, not even the packages that contain it."""
         inside = Path(*self.module.split("."))
         for folder in folders:
             for path in (folder / inside.with_suffix(".py"), folder / inside / "__init__.py"):
-                if path.is_file():
+                if _is_file(path):
+                    if not path.resolve().is_relative_to(folder.resolve()):
+                        raise InputError(f"{self}: {path} is a link out of its folder; copy the file there instead.")
                     return path
-        try:
-            spec = importlib.util.find_spec(self.module)
-        except Exception:  # a parent package that cannot be imported, or is not a package
-            spec = None
-        if spec is None:
-            where = " or ".join(dict.fromkeys(map(str, folders)))
-            raise InputError(
-                f"{self}: there is no module {self.module} in {where}, nor is it installed; "
-                f"put {inside.with_suffix('.py')} beside experiments.yaml."
-            )
-        if not spec.has_location or not str(spec.origin).endswith(".py"):
-            raise InputError(f"{self}: {self.module} is not a Python file; name a function in one.")
-        return Path(str(spec.origin))
+        where = " or ".join(dict.fromkeys(map(str, folders)))
+        raise InputError(f"{self}: there is no {inside.with_suffix('.py')} in {where}; put it beside experiments.yaml.")
 
     def _read(self, path: Path) -> bytes:
         try:
-            source = path.read_bytes()
-        except OSError as error:
-            raise InputError(f"{self}: {path} cannot be read: {error.strerror}.") from None
+            source = strict_yaml.read_bytes(path, MOST_BYTES)
+        except InputError as error:
+            raise InputError(f"{self}: {error}") from None
         if self.digest not in (None, _digest(source)):
             raise InputError(
                 f"{self}: {path} has changed (digest {self.digest} then, {_digest(source)} now); "
@@ -116,19 +116,29 @@ class UserFunction:
 
 
 def search_folders(file: Path | None = None) -> tuple[Path, ...]:
-    """Return where user functions are searched for: the folder of the experiments.yaml in use, the current folder."""
-    return tuple(dict.fromkeys(((file or find_file()).resolve().parent, Path.cwd())))
+    """Return the user's own folders: that of the experiments.yaml in use, unless it is ssmail's, and the current one.
+
+    Raises InputError when the current folder has been removed.
+    """
+    try:
+        beside, here = (file or find_file()).resolve().parent, Path.cwd()
+    except (OSError, RuntimeError):  # RuntimeError: a loop of links
+        raise InputError("the current folder has been removed; change to another one.") from None
+    return tuple(dict.fromkeys(folder for folder in (beside, here) if folder != PACKAGE))
 
 
 def load_label(label: Any) -> "Callable[[Tensor], Tensor] | None":
     """Load the user's label function that `self_supervision.label` names; None if the label is built in or knots.
 
-    The function gets a copy of the alphas (B,) on the CPU. Every call raises InputError, one sentence that names the
-    function, unless it returns a tensor of finite labels (B,).
+    This executes the user's file, so it is for training alone, and for a spec that the user has asked for. The function
+    gets a copy of the alphas (B,) on the CPU. Every call raises InputError, one sentence that names the function,
+    unless it returns a tensor of finite labels (B,). Raises InputError for a label without a digest.
     """
     user_function = UserFunction.parse(label)
     if user_function is None:
         return None
+    if user_function.digest is None:
+        raise InputError(f"self_supervision.label: {user_function} names no digest; build the spec with build_spec.")
     import torch  # not at the top: a plan must not wait for torch
 
     function = user_function.load(search_folders())
@@ -171,4 +181,11 @@ def _digest(source: bytes) -> str:
 
 def _one_line(error: BaseException) -> str:
     """Return an exception as one line without a full stop."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}".rstrip(".: ")
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"[:_LONGEST_REASON].rstrip(".: ")
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # the name is too long, or a folder cannot be searched
+        return False

@@ -3,13 +3,17 @@
 A file holds the arrays of each split (trajectories.FIELDS), named "train/positions" and so on, the `parameters` of the
 set as JSON, and a `hash` of both. Sets of yjunction and letters hold their `centre_lines` too. A mocap set holds the
 `joints` and `parents` of its skeleton, the `scaling` [position_min, position_max, velocity_min, velocity_max] of its
-training split, and the SHA-256 of its `sources`. Nothing is pickled.
+training split, and the SHA-256 of its `sources`. Nothing is pickled or compressed.
 """
 
+import io
 import json
+import math
+import os
+import re
 import zipfile
-from collections.abc import Callable, Mapping
-from dataclasses import astuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +23,31 @@ from pydantic import ValidationError
 from ssmail.config.sections import DataSpec, LettersSpec, YJunctionSpec
 from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
+from ssmail.data.foreign_files import ARCHIVE_ERRORS, is_plain, open_regular, read_whole
 from ssmail.data.mocap import dataset as mocap
+from ssmail.data.mocap.acclaim_lines import is_name
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 
 COMMANDS = {
     "yjunction": "ssmail generate-yjunction",
     "letters": "ssmail generate-letters",
     "mocap": "ssmail prep-mocap",
 }  # what makes the set of each environment
+OTHER_ARRAYS = {
+    "yjunction": ("centre_lines",),
+    "letters": ("centre_lines",),
+    "mocap": ("joints", "parents", "scaling", "sources"),
+}  # of a file, beside those of the splits, `parameters` and `hash`
+
+LARGEST_FILE, MOST_ARRAYS = 2**31, 64  # bytes; members
+LONGEST_TEXT, LONGEST_HEADER = 2**22, 2**10  # bytes of a text, and of what .npy declares about an array
+MAGIC = b"\x93NUMPY\x01\x00"  # of the only version that such arrays need; the header's length follows in two bytes
+HEADER = re.compile(
+    rb"\{'descr': '(<f[248]|<i[248]|<U[1-9]\d{0,6})', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:\d{1,12}, ?)*(?:\d{1,12})?)\), \} *\n"
+)
+DIGEST = re.compile("[0-9a-f]{64}")
 
 
 def generate(data: DataSpec) -> ExpertSet:
@@ -42,9 +62,15 @@ def generate(data: DataSpec) -> ExpertSet:
 
 
 def check_target(path: Path, *, force: bool) -> None:
-    """Raise InputError if `path` exists and `force` is off."""
-    if path.exists() and not force:
+    """Raise InputError if `path` exists and `force` is off, or if it cannot be overwritten."""
+    try:
+        exists, usable = path.exists(), path.is_file() or not path.exists()
+    except OSError as error:
+        raise _unwritable(path, error) from None
+    if exists and not force:
         raise InputError(f"{path} exists already; choose another --out or overwrite it with --force")
+    if not usable:
+        raise InputError(f"{path} is a folder, pipe or device; choose another --out")
 
 
 def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
@@ -61,106 +87,207 @@ def save(experts: ExpertSet, path: Path, *, force: bool = False) -> None:
         arrays["centre_lines"] = experts.centre_lines
     arrays["parameters"] = np.array(json.dumps(experts.parameters))
     arrays["hash"] = np.array(experts.hash)
+    contents = io.BytesIO()
+    np.savez(contents, allow_pickle=False, **arrays)  # compression would save almost nothing
     try:
-        with atomic_write(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)  # compression would save almost nothing
+        with atomic_write(path) as partial:
+            partial.write_bytes(contents.getbuffer())
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; choose a writable --out") from error
+        raise _unwritable(path, error) from error
+
+
+def _unwritable(path: Path, error: OSError) -> InputError:
+    return InputError(f"cannot write {path}: {error.strerror or error}; choose a writable --out")
 
 
 def load(path: Path, environment: str | None = None) -> ExpertSet:
-    """Read an expert set and check its arrays (names, shapes, types, finite values) and its hash.
+    """Read an expert set and check everything in it: names, sizes, shapes, types and values of its arrays, its hash.
 
-    Raises InputError that names the file and the fault, also if the set belongs to another `environment` than given.
+    An array is read only when its declared shape is the one that the parameters of the set require. Raises InputError
+    that names the file and the fault, also if the set belongs to another `environment` than given.
     """
-    file = _File(path, COMMANDS.get(environment or "yjunction", COMMANDS["yjunction"]))
-    file.require("parameters", "hash")
-    found = str(file.parameters().get("environment", "yjunction"))
-    if found not in COMMANDS:
-        raise file.fault(f"{path} is an expert set of {found!r}, which this ssmail does not know")
+    command = COMMANDS.get(environment or "yjunction", COMMANDS["yjunction"])
+    damaged = InputError(f"{path} is truncated or not an .npz file; make it again with `{command} --force`")
+    try:
+        with open_regular(path) as contents:
+            if contents.peek(len(MAGIC)).startswith(MAGIC):
+                raise _fault(f"{path} is a single array, not an .npz of ssmail", command)
+            with zipfile.ZipFile(contents) as archive:
+                return _load(_File(path, command, archive, os.fstat(contents.fileno()).st_size), environment)
+    except FileNotFoundError:
+        remedy = command_line(*command.split(), "--out", path)
+        raise InputError(f"there is no file {path}; make it with `{remedy}`") from None
+    except PermissionError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}; check its permissions") from None
+    except MemoryError:
+        raise _fault(f"{path} does not fit into memory", command) from None
+    except ARCHIVE_ERRORS:
+        raise damaged from None
+
+
+def _load(file: "_File", environment: str | None) -> ExpertSet:
+    parameters = file.json("parameters")
+    found = parameters.get("environment", "yjunction")
+    if not isinstance(found, str) or found not in COMMANDS:
+        raise file.fault(f"{file.path} is an expert set of {found!r:.40}, which this ssmail does not know")
     if environment not in (None, found):
         raise InputError(
-            f"{path} is an expert set of {found}, not of {environment}; train with --env {found}, or name another set "
-            "in data.path"
+            f"{file.path} is an expert set of {found}, not of {environment}; train with --env {found}, or name another "
+            "set in data.path"
         )
     file.command = COMMANDS[found]
-    file.require(*(f"{split}/{field}" for split in SPLITS for field in FIELDS[found]))
+    split_arrays = (f"{split}/{field}" for split in SPLITS for field in FIELDS[found])
+    file.require_exactly("parameters", "hash", *OTHER_ARRAYS[found], *split_arrays)
     try:
-        experts = _READERS[found](file)
-    except (ValueError, ValidationError) as error:
-        raise file.fault(f"the parameters inside {path} cannot be read") from error
-    if experts.hash != str(file.contents["hash"]):
-        raise file.fault(f"{path} was changed after it was written (its hash does not match its arrays)")
+        experts = _READERS[found](file, parameters)
+    except ValidationError as error:
+        raise file.fault(f"the parameters inside {file.path} cannot be read") from error
+    if experts.hash != file.text("hash"):
+        raise file.fault(f"{file.path} was changed after it was written (its hash does not match its arrays)")
+    if not experts.is_scalable:
+        raise file.fault(f"the numbers in {file.path} are too large or too small to be scaled to [-1, 1]")
+    if found == "mocap" and not np.array_equal(
+        file.array("scaling", (4,), np.float64), _mocap_arrays(experts)["scaling"]
+    ):
+        raise file.fault(f"the scaling in {file.path} is not that of its training split")
     return experts
 
 
-class _File:
-    """The arrays of an .npz file, and the command that makes such a file.
+def _fault(what: str, command: str) -> InputError:
+    return InputError(f"{what}; make it again with `{command} --force`")
 
-    Raises InputError, as do all methods, if the file or an array is not as it should be.
+
+@dataclass(frozen=True)
+class _Header:
+    """What the .npy member of an archive declares about its array, and where the data begin."""
+
+    member: zipfile.ZipInfo
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+    fortran: bool
+    begin: int  # bytes before the data
+
+    @property
+    def count(self) -> int:
+        """How many elements the array has."""
+        return math.prod(self.shape)
+
+
+class _File:
+    """The arrays of an open .npz file, and the command that makes such a file.
+
+    Raises InputError, as do all methods, or one of ARCHIVE_ERRORS if a member or an array is not as it should be.
     """
 
-    def __init__(self, path: Path, command: str) -> None:
-        self.path, self.command = path, command
-        try:
-            archive = np.load(path, allow_pickle=False)
-            if isinstance(archive, np.ndarray):
-                raise self.fault(f"{path} is a single array, not an .npz of ssmail")
-            with archive:
-                self.contents: dict[str, Any] = {key: archive[key] for key in archive.files}
-        except FileNotFoundError:
-            raise InputError(f"there is no file {path}; make it with `{command} --out {path}`") from None
-        except (zipfile.BadZipFile, ValueError, EOFError, OSError, KeyError) as error:
-            raise self.fault(f"{path} is truncated or not an .npz file") from error
+    def __init__(self, path: Path, command: str, archive: zipfile.ZipFile, size: int) -> None:
+        """Check the members, and read their headers. size: of the file, in bytes."""
+        self.path, self.command, self.archive = path, command, archive
+        self.headers: dict[str, _Header] = {}
+        members = archive.infolist()
+        if size > LARGEST_FILE or len(members) > MOST_ARRAYS:
+            raise self.fault(f"{path} is larger than any expert set of ssmail")
+        for member in members:
+            key = member.filename.removesuffix(".npy")
+            if key in self.headers:
+                raise self.fault(f"{path} holds the array {key!r:.40} twice")
+            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
+                raise self.fault(f"{key!r:.40} in {path} is compressed or encrypted, which ssmail never does")
+            self.headers[key] = self._header(key, member)
+        if sum(member.file_size for member in members) > size:  # members that lie on one another
+            raise self.fault(f"{path} declares more than it holds")
+
+    def _header(self, key: str, member: zipfile.ZipInfo) -> _Header:
+        """Read the header of a .npy member, which numpy would evaluate as Python."""
+        with self.archive.open(member) as file:
+            start = file.read(len(MAGIC) + 2)
+            length = int.from_bytes(start[len(MAGIC) :], "little")
+            found = HEADER.fullmatch(file.read(min(length, LONGEST_HEADER)))
+        if not start.startswith(MAGIC) or not found:
+            raise self.fault(f"{key!r:.40} in {self.path} is no array of numbers or text")
+        dtype, fortran, sizes = (group.decode() for group in found.groups())
+        shape = tuple(int(size) for size in sizes.split(",") if size.strip())
+        header = _Header(member, np.dtype(dtype), shape, fortran == "True", len(MAGIC) + 2 + length)
+        if header.begin + header.count * header.dtype.itemsize != member.file_size:
+            raise self.fault(f"{key!r:.40} in {self.path} is not as large as its shape says")
+        return header
 
     def fault(self, what: str) -> InputError:
-        return InputError(f"{what}; make it again with `{self.command} --force`")
+        """Return the error to raise; the remedy is always the same."""
+        return _fault(what, self.command)
 
-    def require(self, *keys: str) -> None:
+    def header(self, key: str) -> _Header:
+        """Return what is declared of an array."""
+        if key not in self.headers:
+            raise self.fault(f"{self.path} holds no array {key!r}, so it is not an expert set of ssmail")
+        return self.headers[key]
+
+    def require_exactly(self, *keys: str) -> None:
+        """Raise InputError if an array is missing, or if there are others."""
         for key in keys:
-            if key not in self.contents:
-                raise self.fault(f"{self.path} holds no array {key!r}, so it is not an expert set of ssmail")
-
-    def parameters(self) -> dict[str, Any]:
-        try:
-            parameters = json.loads(str(self.contents["parameters"]))
-        except ValueError as error:
-            raise self.fault(f"the parameters inside {self.path} cannot be read") from error
-        return parameters if isinstance(parameters, dict) else {}
+            self.header(key)
+        for key in self.headers:
+            if key not in keys:
+                raise self.fault(f"{self.path} holds {key!r:.40}, which is no array of such an expert set")
 
     def array(self, key: str, shape: tuple[int, ...], kind: type[np.generic]) -> Any:
         """Return an array, checked to have this shape and this kind of values, all finite."""
-        array = self.contents[key]
-        if array.shape != shape:
-            raise self.fault(f"{key} in {self.path} has shape {array.shape} instead of {shape}")
-        if not np.issubdtype(array.dtype, kind):
-            raise self.fault(f"{key} in {self.path} holds {array.dtype} values")
+        header = self.header(key)
+        if header.shape != shape:
+            raise self.fault(f"{key} in {self.path} has shape {header.shape!s:.40} instead of {shape!s:.40}")
+        if not np.issubdtype(header.dtype, kind):
+            raise self.fault(f"{key} in {self.path} holds {header.dtype} values")
+        with self.archive.open(header.member) as file:
+            file.read(header.begin)
+            data = read_whole(file, header.member.file_size - header.begin) or bytearray()
+        if kind is np.str_:
+            data.decode("utf-32-le")  # raises UnicodeDecodeError for what is no text; numpy trusts it
+        array = np.frombuffer(data, header.dtype)
+        array = array.reshape(shape[::-1]).T if header.fortran else array.reshape(shape)
         if kind is np.float64 and not np.isfinite(array).all():
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
         return array
 
-    def motion(self, split: str, shape: tuple[int, ...]) -> tuple[Any, Any, Any]:
+    def whole_numbers(self, key: str, count: int, allowed: Iterable[int] | None) -> Any:
+        """Return an array (count,) of those numbers that are `allowed`; of any from 0 on if that is None."""
+        array = self.array(key, (count,), np.int64)
+        if not (array >= 0 if allowed is None else np.isin(array, list(allowed))).all():
+            raise self.fault(f"{key} in {self.path} holds a number that it cannot hold")
+        return array
+
+    def motion(self, split: str, shape: tuple[int, ...], modes: int = 1) -> tuple[Any, Any, Any]:
         """Return positions and velocities of this shape (B, T, N, P), and the modes (B,), of a split."""
         positions, velocities = (self.array(f"{split}/{name}", shape, np.float64) for name in FIELDS["letters"][:2])
-        return positions, velocities, self.array(f"{split}/mode", shape[:1], np.int64)
+        return positions, velocities, self.whole_numbers(f"{split}/mode", shape[0], range(modes))
+
+    def text(self, key: str) -> str:
+        """Return an array that is a single text."""
+        if self.header(key).member.file_size > LONGEST_TEXT:
+            raise self.fault(f"{key} in {self.path} is longer than in any expert set of ssmail")
+        return str(self.array(key, (), np.str_)[()])
+
+    def json(self, key: str) -> dict[str, Any]:
+        """Return a text that is a JSON object; an empty one for other JSON."""
+        try:
+            value = json.loads(self.text(key))
+        except (ValueError, RecursionError):
+            raise self.fault(f"the parameters inside {self.path} cannot be read") from None
+        return value if isinstance(value, dict) else {}
 
 
-def _read_yjunction(file: _File) -> ExpertSet:
-    file.require("centre_lines")
-    parameters = file.parameters()
+def _read_yjunction(file: _File, parameters: dict[str, Any]) -> ExpertSet:
     parameters.pop("environment", None)
     params = YJunctionSpec.model_validate(parameters)
     splits = {}
     for split in SPLITS:
         shape = (getattr(params, split), params.steps, params.agents, 2)
+        motion = file.motion(split, shape, modes=len(yjunction.LANES))
         continuations = file.array(f"{split}/continuations", (len(yjunction.LANES), *shape), np.float64)
-        splits[split] = Trajectories(*file.motion(split, shape), continuations)
-    return ExpertSet.bundle(splits, file.contents["centre_lines"], params.model_dump(mode="json"))
+        splits[split] = Trajectories(*motion, continuations)
+    lines = file.array("centre_lines", (len(yjunction.LANES), yjunction.POINTS, 2), np.float64)
+    return ExpertSet.bundle(splits, lines, params.model_dump(mode="json"))
 
 
-def _read_letters(file: _File) -> ExpertSet:
-    file.require("centre_lines")
-    parameters = file.parameters()
+def _read_letters(file: _File, parameters: dict[str, Any]) -> ExpertSet:
     parameters.pop("environment")
     params = LettersSpec.model_validate(parameters)
     splits = {}
@@ -171,24 +298,38 @@ def _read_letters(file: _File) -> ExpertSet:
     return ExpertSet.bundle(splits, lines, {"environment": "letters", **params.model_dump(mode="json")})
 
 
-def _read_mocap(file: _File) -> ExpertSet:
-    file.require("joints", "parents", "scaling", "sources")
-    params = mocap.MocapParameters.model_validate_json(str(file.contents["parameters"]))
-    sources = json.loads(str(file.contents["sources"]))
-    count = file.contents["joints"].size
-    joints, parents = file.array("joints", (count,), np.str_), file.array("parents", (count,), np.int64)
+def _read_mocap(file: _File, _: dict[str, Any]) -> ExpertSet:
+    params = mocap.MocapParameters.model_validate_json(file.text("parameters"))
+    joints, parents = _read_skeleton(file)
     splits = {}
     for split in SPLITS:
-        windows = max(1, file.contents[f"{split}/trial"].size)
-        positions, velocities, _ = file.motion(split, (windows, params.window_of(split), count, 3))
-        cut = (file.array(f"{split}/{name}", (windows,), np.int64) for name in ("trial", "frame"))
-        splits[split] = Trajectories.single_mode(positions, velocities, *cut)
-    skeleton = tuple(joints.tolist()), tuple(parents.tolist())
-    experts = ExpertSet.bundle(splits, mocap.NO_LINES, params.model_dump(mode="json"), *skeleton, sources)
-    stored = file.array("scaling", (4,), np.float64)
-    if experts.hash == str(file.contents["hash"]) and not np.array_equal(stored, _mocap_arrays(experts)["scaling"]):
-        raise file.fault(f"the scaling in {file.path} is not that of its training split")
-    return experts
+        windows = max(1, file.header(f"{split}/trial").count)
+        positions, velocities, _ = file.motion(split, (windows, params.window_of(split), len(joints), 3))
+        trials = file.whole_numbers(f"{split}/trial", windows, getattr(params, split))
+        frames = file.whole_numbers(f"{split}/frame", windows, None)
+        splits[split] = Trajectories.single_mode(positions, velocities, trials, frames)
+    sources = file.json("sources")
+    if not all(isinstance(digest, str) and DIGEST.fullmatch(digest) for digest in sources.values()):
+        raise file.fault(f"the sources inside {file.path} are not the digests of files")
+    return ExpertSet.bundle(splits, mocap.NO_LINES, params.model_dump(mode="json"), joints, parents, sources)
+
+
+def _read_skeleton(file: _File) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Return the names of the joints, and their parents. Raises InputError unless all hang on joint 0."""
+    count = file.header("joints").count
+    joints = file.array("joints", (count,), np.str_).tolist()
+    parents = file.array("parents", (count,), np.int64).tolist()
+    if len(set(joints)) < count or not all(map(is_name, joints)):
+        raise file.fault(f"the joints in {file.path} have no proper names")
+    children: dict[int, list[int]] = {}
+    for joint, parent in enumerate(parents):
+        children.setdefault(parent, []).append(joint)
+    hanging = [0] if parents[:1] == [-1] else []
+    for joint in hanging:
+        hanging += children.get(joint, [])
+    if len(hanging) != max(count, 1):
+        raise file.fault(f"the joints in {file.path} do not all hang on the first one")
+    return tuple(joints), tuple(parents)
 
 
 def _mocap_arrays(experts: ExpertSet) -> dict[str, Any]:
@@ -200,7 +341,7 @@ def _mocap_arrays(experts: ExpertSet) -> dict[str, Any]:
     }
 
 
-_READERS: Mapping[str, Callable[[_File], ExpertSet]] = {
+_READERS: Mapping[str, Callable[[_File, dict[str, Any]], ExpertSet]] = {
     "yjunction": _read_yjunction,
     "letters": _read_letters,
     "mocap": _read_mocap,

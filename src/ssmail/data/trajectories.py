@@ -14,6 +14,7 @@ from ssmail.data.scaling import Scaling
 Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes
 Integers = NDArray[np.int64]
 SPLITS = ("train", "validation", "test")
+LARGEST_SCALED = 1e6  # of scaled positions and velocities; those to train on are in [-1, 1]
 FIELDS = {  # environment -> the arrays of a split that are hashed and stored, in this order; the rest follows from them
     "yjunction": ("positions", "velocities", "mode", "continuations"),
     "letters": ("positions", "velocities", "mode"),
@@ -116,6 +117,23 @@ class ExpertSet:
     def scaling(self) -> Scaling:
         """The scaling to [-1, 1], fitted to the training split only."""
         return Scaling.fit(self.train.positions, self.train.velocities)
+
+    @property
+    def is_scalable(self) -> bool:
+        """Whether there is a scaling, and none of the numbers is larger than LARGEST_SCALED once scaled."""
+        try:
+            scaling = self.scaling
+        except ValueError:
+            return False
+        splits = (self.train, self.validation, self.test)
+        places = [self.centre_lines, *(array for split in splits for array in (split.positions, split.continuations))]
+        scaled = [scaling.scale_positions(float(end)) for array in places if array.size for end in _ends(array)]
+        scaled += [scaling.scale_velocities(float(end)) for split in splits for end in _ends(split.velocities)]
+        return all(abs(value) <= LARGEST_SCALED for value in scaled)
+
+
+def _ends(array: Floats) -> tuple[np.float64, np.float64]:
+    return array.min(), array.max()
 
 
 def generate_splits(

@@ -18,6 +18,7 @@ LANES = (1.0, -1.0)  # sign of y: lane 0 bends to +y, lane 1 to -y
 FORK = 0.3  # where the lanes part, as a fraction of the number of steps
 FILE = 0.16  # length of the file of agents, as the same fraction
 ARC = 0.12  # length of the bend, as the same fraction
+POINTS = 200  # of the polyline of a lane
 SPREADS = {"start": 2.0, "gap": 0.75, "speed": 0.05, "offset": 0.6}  # half-widths of the uniform draws at jitter 1
 
 
@@ -32,7 +33,7 @@ def generate(params: YJunctionSpec) -> ExpertSet:
     return ExpertSet.bundle(splits, lines, params.model_dump(mode="json"))
 
 
-def centre_line(params: YJunctionSpec, lane: int, points: int = 200) -> Floats:
+def centre_line(params: YJunctionSpec, lane: int, points: int = POINTS) -> Floats:
     """Return the polyline (points, 2) of the street and one lane, as far as a leader can get."""
     farthest = params.steps * (1 + SPREADS["speed"] * params.jitter) + SPREADS["start"] * params.jitter
     s = np.linspace(-FILE * params.steps - (SPREADS["start"] + 1) * params.jitter, farthest, points)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Job, Kind, RunSettings
 from ssmail.execution.planning import check_labels, plan_cell
@@ -130,7 +130,7 @@ class _Worker:
             self._stderr.seek(0)
             messages = self._stderr.read().decode(errors="replace").strip().splitlines()
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return f"its process {how}" + (f": {messages[-1]}" if messages else "")
+        return f"its process {how}" + (f": {masked(messages[-1])}" if messages else "")
 
 
 class _Pool:

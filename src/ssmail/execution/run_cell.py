@@ -5,18 +5,18 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.planning import BEST, LAST, LASTS, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
+from ssmail.store.checkpoint_files import run_folder
 from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
 
@@ -79,10 +79,10 @@ def run_cell(
     on_event(Event("resumed" if plan.row else "started", cell, writer.run_id, loop.epoch, epochs))
     with _heartbeats(writer, settings.heartbeat_seconds):
         try:
-            return _train(cell, loop, writer, store.checkpoint_root / writer.run_id, on_event, should_stop)
+            return _train(cell, loop, writer, on_event, should_stop)
         except Exception as error:
             with suppress(SsmailError):  # if writing to the store fails too, report the first error
-                writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{traceback.format_exc()}")
+                writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(traceback.format_exc())}")
             return Event("failed", cell, writer.run_id, loop.epoch, epochs, message=_summary(error))
 
 
@@ -103,11 +103,12 @@ def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop:
 
 def _load_last(store: Store, run_id: str, loop: Loop) -> None:
     """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
-    folder = store.checkpoint_root / run_id
+    folder = run_folder(store.checkpoint_root, run_id)
     recorded = [row for row in store.artifacts(run_id) if row.name == LAST]
     sha256 = recorded[0].sha256 if recorded else None  # runs of older versions record it at their end only
-    name = recorded[0].path.name if recorded else LAST
-    last = folder / (name if name in LASTS else LAST)
+    last = recorded[0].path if recorded else folder / LAST
+    if last is None or last.name not in LASTS:
+        raise InputError(f"run {run_id[:8]} has its checkpoint recorded in another folder; {AFRESH}")
     if not os.path.lexists(last):
         return
     try:
@@ -120,7 +121,6 @@ def _train(
     cell: Cell,
     loop: Loop,
     writer: RunWriter,
-    folder: Path,
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
 ) -> Event:
@@ -137,22 +137,22 @@ def _train(
         try:
             metrics = loop.run_epoch()
         except Divergence as error:
-            _record_checkpoints(writer, folder, _last_name(epochs, loop.epoch))
+            _record_checkpoints(writer, _last_name(epochs, loop.epoch))
             writer.finish(RunState.DIVERGED, str(error))
             return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
         writer.epoch(loop.epoch, metrics)
         if loop.snapshot:
             writer.arrays(loop.snapshot)
         if loop.improved:
-            save_checkpoint(folder / BEST, loop.best_state_dict())
-        last = folder / _last_name(epochs, loop.epoch)
-        save_checkpoint(last, loop.state_dict())
+            save_checkpoint(writer.folder / BEST, loop.best_state_dict())
+        last = _last_name(epochs, loop.epoch)
+        save_checkpoint(writer.folder / last, loop.state_dict())
         writer.artifact(LAST, last)
         on_event(Event("epoch", cell, writer.run_id, loop.epoch, epochs, metrics))
     metrics, arrays = loop.final_evaluation()
     writer.final(loop.epoch, metrics)
     writer.arrays(arrays)
-    _record_checkpoints(writer, folder, LAST)
+    _record_checkpoints(writer, LAST)
     writer.finish(RunState.FINISHED)
     return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
 
@@ -162,12 +162,12 @@ def _last_name(epochs: int, epoch: int) -> str:
     return LASTS[(epochs - epoch) % 2]
 
 
-def _record_checkpoints(writer: RunWriter, folder: Path, last: str) -> None:
+def _record_checkpoints(writer: RunWriter, last: str) -> None:
     """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left there."""
     for name, file in ((BEST, BEST), (LAST, last)):
-        if (folder / file).exists():
-            writer.artifact(name, folder / file)
-    for stray in (*folder.glob(".*.partial"), *(folder / name for name in LASTS if name != last)):
+        if (writer.folder / file).exists():
+            writer.artifact(name, file)
+    for stray in (*writer.folder.glob(".*.partial"), *(writer.folder / name for name in LASTS if name != last)):
         stray.unlink(missing_ok=True)
 
 
@@ -191,4 +191,4 @@ def _heartbeats(writer: RunWriter, seconds: float) -> Iterator[None]:
 
 
 def _summary(error: Exception) -> str:
-    return str(error) if isinstance(error, SsmailError) else f"{type(error).__name__}: {error}"
+    return masked(str(error) if isinstance(error, SsmailError) else f"{type(error).__name__}: {error}")

@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
+from ssmail.data.foreign_files import open_regular, read_whole
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance, training_curves
-from ssmail.plots.provenance import Provenance, RunSource
+from ssmail.plots.provenance import LARGEST, Provenance, RunSource
 from ssmail.plots.saving import csv_text, digest
 from ssmail.store import RunRow, Store
 
@@ -58,11 +59,16 @@ def explain(path: Path) -> Explanation:
 
     Raises InputError for a file that is not a figure saved by ssmail, and for a CSV without its figure beside it.
     """
+    figure, csv = path, path.with_suffix(".csv")
     if path.suffix.lower() == ".csv":
-        return _of_csv(path)
-    source = provenance.read(path)
-    csv = path.with_suffix(".csv")
-    return Explanation(path, source, csv, _csv_state(csv, source))
+        beside = [path.with_suffix(ending) for ending in ENDINGS if path.with_suffix(ending).exists()]
+        if not path.is_file():
+            raise InputError(f"{path} cannot be read: there is no such file.")
+        if not beside:
+            raise InputError(f"{path} has no figure beside it that tells its runs; give the one that it belongs to.")
+        figure, csv = beside[0], path
+    source = provenance.read(figure)
+    return Explanation(figure, source, csv, _csv_state(csv, source))
 
 
 def compare(explanation: Explanation, store: Store) -> Agreement:
@@ -79,7 +85,7 @@ def compare(explanation: Explanation, store: Store) -> Agreement:
         return Agreement(store.where, runs, None, "an older ssmail drew it, which kept no hash of what it shows")
     try:
         table = _collect_again(source, store)
-    except (InputError, TypeError) as error:
+    except InputError as error:
         return Agreement(store.where, runs, None, str(error).rstrip("."))
     text = csv_text(table)
     if digest(text) == source.csv_sha256:
@@ -87,27 +93,17 @@ def compare(explanation: Explanation, store: Store) -> Agreement:
     return Agreement(store.where, runs, "different", _first_difference(explanation, text))
 
 
-def _of_csv(path: Path) -> Explanation:
-    if not path.is_file():
-        raise InputError(f"{path} cannot be read: there is no such file.")
-    for ending in ENDINGS:
-        figure = path.with_suffix(ending)
-        if figure.exists():
-            source = provenance.read(figure)
-            return Explanation(figure, source, path, _csv_state(path, source))
-    raise InputError(f"{path} has no figure beside it that tells its runs; give the .png, .pdf or .svg it belongs to.")
-
-
 def _csv_state(csv: Path, source: Provenance) -> str | None:
     if source.csv_sha256 is None:
         return None
     try:
-        text = csv.read_bytes().decode("utf-8")
+        with open_regular(csv) as file:
+            contents = read_whole(file, LARGEST)
     except FileNotFoundError:
         return "missing"
-    except (OSError, UnicodeDecodeError):
+    except OSError:
         return "altered"
-    return "as written" if digest(text) == source.csv_sha256 else "altered"
+    return "as written" if contents and sha256(contents).hexdigest() == source.csv_sha256 else "altered"
 
 
 def _run_state(run_id: str, sources: Sequence[RunSource], stored: dict[str, RunRow]) -> str:
@@ -129,24 +125,29 @@ def _run_state(run_id: str, sources: Sequence[RunSource], stored: dict[str, RunR
 
 def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
     """Collect the table of the same figure from the same runs, with the same options."""
-    options: dict[str, Any] = dict(source.options)
-    if "statistic" in options:
-        options["statistic"] = Statistic(options["statistic"])
-    if source.figure == training_curves.NAME:
-        return training_curves.collect(store, store.runs(ids=source.run_ids), **options).table()
-    if source.figure not in FIGURES:
-        raise InputError(f"this ssmail draws no figure {source.figure}")
-    module = FIGURES[source.figure]
-    if module.has_environment and source.runs:
-        options["environment"] = source.runs[0].environment
-    return module.collect(store, source.run_ids, **options).table()
+    name, options = source.figure, source.options
+    try:
+        statistic = Statistic(options.get("statistic", Statistic.MEAN_STD))
+    except ValueError:
+        raise InputError("this ssmail does not know the statistic that it was drawn with") from None
+    if name == training_curves.NAME:
+        metrics, group_by = options.get("metrics"), options.get("group_by")
+        if not isinstance(metrics, list) or not isinstance(group_by, str):
+            raise InputError("it does not tell which metrics of which groups it shows")
+        runs = store.runs(ids=source.run_ids)
+        return training_curves.collect(store, runs, [*map(str, metrics)], group_by, statistic).table()
+    if name not in FIGURES:
+        raise InputError(f"this ssmail draws no figure {name}")
+    module = FIGURES[name]
+    environment = source.runs[0].environment if module.has_environment and source.runs else None
+    return module.collect(store, source.run_ids, statistic=statistic, environment=environment).table()
 
 
 def _first_difference(explanation: Explanation, text: str) -> str:
     """The first line in which the CSV differs, if the one that was written with the figure is still there."""
     if explanation.csv_state != "as written":
         return "the CSV that was written with it is not there to say where"
-    written = explanation.csv.read_bytes().decode("utf-8").splitlines()
+    written = explanation.csv.read_text("utf-8", "replace").splitlines()
     for number, (was, now) in enumerate(zip_longest(written, text.splitlines(), fillvalue="nothing"), start=1):
         if was != now:
             return f"line {number} of {explanation.csv.name} was {was}, is {now}"

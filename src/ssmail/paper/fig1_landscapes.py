@@ -230,7 +230,9 @@ def draw(record: LandscapesRecord) -> Figure:
         _title(grid[1], 1, "ideal reward")
         for place, item in enumerate(record.shown, start=2):
             images.append(landscape_grids.draw_reward(grid[place], item.landscape, item.reward))
-            _title(grid[place], place, f"{item.label}, seed {item.run.seed}, epoch {item.landscape.epoch}")
+            _title(
+                grid[place], place, f"{style.literal(item.label)}, seed {item.run.seed}, epoch {item.landscape.epoch}"
+            )
         landscape_grids.label_axes(list(grid[:panels]), 2, record.shown[0].run.environment)
         for axes in grid[1:panels]:
             landscape_grids.draw_paths(axes, record.landscape.expert[:4], landscape_grids.EXPERT, lw=0.5)

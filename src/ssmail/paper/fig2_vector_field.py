@@ -304,4 +304,4 @@ def _draw_field(axes: Axes, field: Field, spacing: float) -> None:
             pivot="tail",
             zorder=3,
         )
-    axes.set_title(rf"$\alpha$ in {field.label}, seed {field.run.seed}", fontsize=7, pad=2)
+    axes.set_title(rf"$\alpha$ in {style.literal(field.label)}, seed {field.run.seed}", fontsize=7, pad=2)

@@ -21,6 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import printable
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
@@ -130,7 +131,7 @@ def draw(record: CurriculaRecord) -> Figure:
             handles.append(line)
         for shown, curve in zip(record.bands, record.expected, strict=True):
             (line,) = axes.plot(curve.epochs, curve.values, color=style.REFERENCE, lw=0.8, ls=DASHES, zorder=4)
-            line.set_gid(f"closed-form-{shown.label}")
+            line.set_gid(printable(f"closed-form-{shown.label}"))
         handles.append(Line2D([], [], color=style.REFERENCE, lw=0.8, ls=DASHES, label="expected, T / (1 + (T - 1) f)"))
         title = curves.legend_title(record.statistic)
         figure.legend(handles=handles, loc="outside upper center", ncols=1, title=title)

@@ -220,13 +220,16 @@ def draw(record: ModesRecord) -> Figure:
                 continue
             axes.tick_params(labelbottom=(row + 1, column) not in cells)
             if len(labels) == 2 and row == 0:
-                axes.set_title(panel.label, weight="bold", pad=4)
-            title = f"{panel.label}\nseed {panel.seed}" if len(labels) > 2 else f"seed {panel.seed}"
+                axes.set_title(style.literal(panel.label), weight="bold", pad=4)
+            title = f"{style.literal(panel.label)}\nseed {panel.seed}" if len(labels) > 2 else f"seed {panel.seed}"
             _draw_panel(axes, panel, record, title, strokes[panel.label].colour)
         figure.supxlabel("x (step lengths)", fontsize=8)
         figure.supylabel("y (step lengths)", fontsize=8)
         handles = [Line2D([], [], color=style.LANE, lw=LANE_WIDTH, label="expert, both lanes")]
-        handles += [Line2D([], [], color=strokes[label].colour, lw=1.2, label=f"{label}, sampled") for label in labels]
+        handles += [
+            Line2D([], [], color=strokes[label].colour, lw=1.2, label=f"{style.literal(label)}, sampled")
+            for label in labels
+        ]
         figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 3), columnspacing=1.2)
         return figure
 

@@ -26,6 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import printable
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import less_spread, smaller
@@ -169,7 +170,7 @@ def draw(record: BetaRecord) -> Figure:
         lower.set_ylim(-0.02, 0.52)
         lower.set_ylabel("lane_balance\n(share)")
         labels = [re.sub(r"^0\.", ".", column.label) for column in record.columns]  # to fit beside their neighbours
-        lower.set_xticks(range(len(record.columns)), labels)
+        lower.set_xticks(range(len(record.columns)), list(map(style.literal, labels)))
         lower.set_xlabel("β (fraction of the epochs, evenly spaced values)")
         for axes in (upper, lower):
             axes.grid(False, axis="x")
@@ -191,10 +192,12 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
         x = _places(index, len(column.error))
         finite = np.isfinite(column.error)
         (points,) = axes.plot(x[finite], column.error[finite], ".", color=POINTS, ms=5, mew=0, alpha=0.8)
-        points.set_gid(f"runs-{column.label}")
+        points.set_gid(printable(f"runs-{column.label}"))
         if column.diverged:
             top = np.full(column.diverged, axes.get_ylim()[1])
-            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(f"diverged-{column.label}")
+            style.draw_cross(axes, x[np.isposinf(column.error)], top, CROSSES).set_gid(
+                printable(f"diverged-{column.label}")
+            )
     lowest = np.array([np.fmin.reduce(column.error) for column in record.columns])
     centre, low, high = np.array([column.error_summary for column in record.columns]).T
     line = _draw_centres(axes, Summary(centre, style.cut_low(low, lowest), high))
@@ -210,7 +213,9 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
 def _draw_balances(axes: Axes, record: BetaRecord) -> None:
     for index, column in enumerate(record.columns):
         x = _places(index, len(column.balance))
-        axes.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=f"balances-{column.label}")
+        axes.plot(
+            x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=printable(f"balances-{column.label}")
+        )
     _draw_centres(axes, Summary(*np.array([column.balance_summary for column in record.columns]).T))
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmail.errors import InputError, unknown_name
+from ssmail.errors import InputError, command_line, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.paper.samples import Runs
@@ -78,11 +78,11 @@ def _judgement(
 
 def _command(claim: Claim, decision: Decision, profile: str) -> str:
     """The command that trains the missing runs, or as many as should settle the claim."""
-    start = f"ssmail reproduce --only {claim.figure} --profile {profile} --seeds 0-"
+    start = ("ssmail", "reproduce", "--only", claim.figure, "--profile", profile, "--seeds")
     samples = [sample for part in decision.parts for sample in part.samples]
     if any(not sample.seeds for sample in samples):
-        return f"{start}{FIRST_SEEDS - 1}"
+        return command_line(*start, f"0-{FIRST_SEEDS - 1}")
     if not decision.more_seeds:
         return ""
     highest = max(seed for sample in samples for seed in sample.seeds)
-    return f"{start}{highest + decision.more_seeds}"
+    return command_line(*start, f"0-{highest + decision.more_seeds}")

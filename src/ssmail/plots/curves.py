@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from ssmail.data.trajectories import Floats, Integers
-from ssmail.errors import InputError
+from ssmail.errors import InputError, printable
 from ssmail.evaluation.metrics import DIVERGED
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
 from ssmail.plots import style
@@ -181,7 +181,7 @@ def draw_band(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> Lin
     low, high = shown.edges(axes.get_yscale() == "log", axes.get_ylim()[1])
     axes.fill_between(shown.epochs, low, high, color=stroke.colour, alpha=0.22, lw=0)
     drawn = draw_centre(axes, shown, stroke, **line)
-    drawn.set(label=shown.label, gid=f"centre-{shown.label}")
+    drawn.set(label=style.literal(shown.label), gid=printable(f"centre-{shown.label}"))
     return drawn
 
 
@@ -209,9 +209,9 @@ def _draw_end(axes: Axes, curve: Curve, stroke: style.Stroke, upwards: bool) -> 
 
 
 def count_label(shown: Band) -> str:
-    """ "gail: 5 runs, 1 diverged (x)"."""
+    """ "gail: 5 runs, 1 diverged (x)", for matplotlib."""
     fate = f", {shown.diverged} diverged (x)" if shown.diverged else ""
-    return f"{shown.label}: {counted(len(shown.curves), 'run')}{fate}"
+    return f"{style.literal(shown.label)}: {counted(len(shown.curves), 'run')}{fate}"
 
 
 def legend_title(statistic: Statistic) -> str:

@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from ssmail.errors import InputError
-from ssmail.plots import landscape_grids, style
+from ssmail.plots import landscape_grids, saving, style
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
 from ssmail.store import RunRow, Store
@@ -95,18 +95,8 @@ def save_film(record: LandscapeRecord, outdir: Path) -> Path:
     path = outdir / f"{record.stem}.gif"
     with style.sheet():
         pictures = [picture.quantize(colors=128) for picture in _film(record)]
-    try:
-        outdir.mkdir(parents=True, exist_ok=True)
-        pictures[0].save(
-            path,
-            save_all=True,
-            append_images=pictures[1:],
-            duration=[round(1000 * SECONDS)] * (len(pictures) - 1) + [round(1000 * LAST)],
-            loop=0,
-            comment=record.provenance.as_json(),
-        )
-    except OSError as error:
-        raise InputError(f"{outdir} cannot be written: {error.strerror}; choose another folder.") from None
+    times = [SECONDS] * (len(pictures) - 1) + [LAST]
+    saving.save_film(pictures, path, [round(1000 * seconds) for seconds in times], record.provenance)
     return path
 
 
@@ -151,7 +141,7 @@ def _draw_legend(figure: Figure, record: LandscapeRecord, landscape: Landscape) 
     run = record.run
     kinds = {"expert": landscape_grids.EXPERT, "policy": landscape_grids.POLICY}
     handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
-    title = f"{run.method}, seed {run.seed}: epoch {landscape.epoch} of {_epochs(run)}"
+    title = f"{style.literal(run.method)}, seed {run.seed}: epoch {landscape.epoch} of {_epochs(run)}"
     figure.legend(handles=handles, title=title, loc="outside upper center", ncols=2)
 
 

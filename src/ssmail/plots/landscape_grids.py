@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.image import AxesImage
 
 from ssmail.data.trajectories import Floats, Integers
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 from ssmail.evaluation.landscape import Plane, nearest_points, slope_share
 from ssmail.store import RunRow, Store
 
@@ -88,7 +88,8 @@ def _lack(run: RunRow) -> str:
         return f"({run.method}) learns no reward, so it has no landscape; take one of ssail, gail or wail."
     if run.environment == "mocap":
         return "is on mocap, which is not planar; only planar environments have landscapes."
-    remedy = f"`ssmail train --method {run.method} --env {run.environment} --profile {run.profile} --resume never`"
+    options = ("--method", run.method, "--env", run.environment, "--profile", run.profile)
+    remedy = f"`{command_line('ssmail', 'train', *options, '--resume', 'never')}`"
     return f"stored no landscape: an older ssmail trained it, or it was stopped before its first epoch; run {remedy}."
 
 

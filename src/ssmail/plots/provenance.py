@@ -3,26 +3,34 @@
 The record is one line of JSON under one key of each format: `ssmail` (PNG), `Keywords` (PDF), `dc:description` (SVG); a
 film (GIF) has it as its comment.
 No date is written, so that equal runs give equal files.
+
+Figures come from anywhere, so nothing in one is believed: its size is bounded, it has to be complete, entities in an
+SVG are refused, no picture is decoded, and the record is checked key by key.
 """
 
+import io
 import json
 import re
-import xml.etree.ElementTree as ElementTree
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Self
+from xml.parsers import expat
 
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
+from pydantic import TypeAdapter
 
 from ssmail import __version__
+from ssmail.data.foreign_files import open_regular, read_whole
 from ssmail.errors import InputError
 from ssmail.store import RunRow
 from ssmail.store.comparison import spec_differences
 
 FORMATS = ("png", "pdf", "svg")
 
-_SVG_DESCRIPTION = "{http://purl.org/dc/elements/1.1/}description"
+LARGEST = 256 * 2**20  # bytes of a figure
+_SVG_DESCRIPTION = "http://purl.org/dc/elements/1.1/ description"
 
 
 @dataclass(frozen=True)
@@ -94,11 +102,11 @@ class Provenance:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """The inverse of `as_json`. Raises ValueError or TypeError on other text."""
-        values: dict[str, Any] = json.loads(text)
-        lists = {key: tuple(value) for key, value in values.items() if isinstance(value, list)}
-        sources = tuple(RunSource(**source) for source in values.get("runs", ()))
-        return cls(**{**values, **lists, "runs": sources})
+        """The inverse of `as_json`. Raises ValueError on any text that is not of its form."""
+        found = TypeAdapter(cls).validate_json(text, strict=True)
+        if len({*found.run_ids}) < len(found.run_ids):
+            raise ValueError("a run is named twice")
+        return found
 
     def metadata(self, format: str) -> dict[str, Any]:
         """What to pass as `metadata` to `Figure.savefig` for one of FORMATS."""
@@ -120,15 +128,23 @@ def read(path: Path) -> Provenance:
     if reader is None:
         raise InputError(f"{path} is no figure of ssmail; give a file that ends in .png, .pdf, .svg or .gif.")
     try:
-        return Provenance.from_json(reader(path))
+        with open_regular(path) as file:
+            data = read_whole(file, LARGEST)
     except OSError as error:
-        if isinstance(error, UnidentifiedImageError):
-            raise InputError(
-                f"{path} is not a {path.suffix[1:].upper()} image; draw it again with `ssmail plot`."
-            ) from None
         raise InputError(f"{path} cannot be read: {error.strerror or error}.") from None
-    except (ValueError, TypeError, KeyError, ElementTree.ParseError):
+    if data is None:
+        raise InputError(f"{path} has more than {LARGEST >> 20} MB; give a figure that ssmail saved.")
+    try:
+        return Provenance.from_json(reader(bytes(data)))
+    except _DamagedError:
+        kind = path.suffix[1:].upper()
+        raise InputError(f"{path} is not a whole {kind} image; draw it again with `ssmail plot`.") from None
+    except (ValueError, KeyError):
         raise InputError(f"{path} carries no run ids of ssmail; draw it again with `ssmail plot`.") from None
+
+
+class _DamagedError(Exception):
+    """The file is not of the format that its name says, or a part of it is missing or altered."""
 
 
 def _distinct(values: Any) -> tuple[str, ...]:
@@ -150,25 +166,59 @@ def _source(run: RunRow, curve: str) -> RunSource:
     )
 
 
-def _png_text(path: Path) -> str:
-    with Image.open(path, formats=["PNG"]) as image:
-        return str(image.info["ssmail"])
+def _png_text(data: bytes) -> str:
+    found = _checked(data, "PNG")["ssmail"]  # all chunks have the right checksums; nothing is decoded
+    return str(found)
 
 
-def _gif_comment(path: Path) -> str:
-    with Image.open(path, formats=["GIF"]) as image:
-        comment: bytes = image.info["comment"]
+def _gif_comment(data: bytes) -> str:
+    if not data.endswith(b";"):
+        raise _DamagedError
+    comment: bytes = _checked(data, "GIF")["comment"]
     return comment.decode("ascii")
 
 
-def _pdf_text(path: Path) -> str:
+def _checked(data: bytes, format: str) -> dict[Any, Any]:
+    """Return the texts in an image, unless it is damaged. Pillow raises errors of many types on crafted files."""
+    try:
+        with warnings.catch_warnings(), Image.open(io.BytesIO(data), formats=[format]) as image:
+            warnings.simplefilter("error")  # of an enormous image
+            info = dict(image.info)
+            image.verify()
+    except Exception:
+        raise _DamagedError from None
+    return info
+
+
+def _pdf_text(data: bytes) -> str:
     """The Keywords of the information dictionary, which matplotlib writes uncompressed."""
-    found = re.search(rb"/Keywords \(((?:[^\\()]|\\.)*)\)", path.read_bytes(), re.DOTALL)
+    if not data.startswith(b"%PDF-") or not data.rstrip().endswith(b"%%EOF"):
+        raise _DamagedError
+    found = re.search(rb"/Keywords \(((?:[^\\()]|\\.)*)\)", data, re.DOTALL)
     if found is None:
         raise ValueError("no keywords")
     return re.sub(rb"\\(.)", rb"\1", found.group(1)).decode("ascii")
 
 
-def _svg_text(path: Path) -> str:
-    element = ElementTree.parse(path).getroot().find(f".//{_SVG_DESCRIPTION}")
-    return (element.text or "") if element is not None else ""
+def _svg_text(data: bytes) -> str:
+    """The text of the dc:description. No tree is built, and entities are refused, which can expand without end."""
+    path: list[str] = []
+    texts: list[str] = []
+
+    def refuse(*_: object) -> None:
+        raise _DamagedError
+
+    def read(text: str) -> None:
+        if path[-1] == _SVG_DESCRIPTION:
+            texts.append(text)
+
+    parser = expat.ParserCreate(namespace_separator=" ")
+    parser.EntityDeclHandler = refuse
+    parser.StartElementHandler = lambda name, _: path.append(name)
+    parser.EndElementHandler = lambda _: path.pop()
+    parser.CharacterDataHandler = read
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError:
+        raise _DamagedError from None
+    return "".join(texts)

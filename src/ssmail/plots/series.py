@@ -27,7 +27,7 @@ from ssmail.config.experiments import (
 )
 from ssmail.config.experiments_file import load_experiments
 from ssmail.config.spec import RunSpec, flatten
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted
 from ssmail.plots.run_groups import (
@@ -70,8 +70,9 @@ class _Comparison(NamedTuple):
         if self.ablation is None:
             return train_command(method, self.environment, profile)
         elsewhere = self.environment != ablation(self.ablation.name).environment
-        where = f" --env {self.environment}" if elsewhere else ""
-        return f"`ssmail ablate {self.ablation.name}{where} --profile {profile or 'quick'} --seeds 0-4`"
+        where = ("--env", self.environment) if elsewhere else ()
+        options = (*where, "--profile", profile or "quick", "--seeds", "0-4")
+        return f"`{command_line('ssmail', 'ablate', self.ablation.name, *options)}`"
 
 
 class _Family(NamedTuple):
@@ -186,7 +187,8 @@ def figure_ablation(figure: str) -> Ablation:
 
 def train_command(method: str, environment: str, profile: str | None = None) -> str:
     """Return the command that trains runs of this method."""
-    return f"`ssmail train --method {method} --env {environment} --profile {profile or 'quick'} --seeds 0-4`"
+    options = ("--method", method, "--env", environment, "--profile", profile or "quick")
+    return f"`{command_line('ssmail', 'train', *options, '--seeds', '0-4')}`"
 
 
 def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:

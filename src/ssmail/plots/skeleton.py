@@ -21,8 +21,8 @@ from PIL import Image
 
 from ssmail.data import expert_sets
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
-from ssmail.errors import InputError, unknown_name
-from ssmail.plots import style
+from ssmail.errors import InputError, printable, unknown_name
+from ssmail.plots import saving, style
 from ssmail.plots.provenance import Provenance
 
 NAME = "skeleton"
@@ -41,6 +41,8 @@ HEAD = "head"
 MARGIN = 1.2  # around the skeleton, in file units, of which a person has about 30
 TICK = 10.0
 HIGHEST = 5.0  # inches of a film
+TALLEST = 20.0  # inches of a picture
+FARTHEST = 2000.0  # file units that a picture may span, with a tick every TICK
 STILL = 1e-6  # file units; a root that moves less has no walking direction
 
 
@@ -84,7 +86,7 @@ class SkeletonRecord:
 def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
     """Collect one window of the set that `ssmail prep-mocap` wrote to `path`.
 
-    Raises InputError when there is no such set, split or window.
+    Raises InputError when there is no such set, split or window, and when the window spans more than FARTHEST.
     """
     if split not in SPLITS:
         raise unknown_name("split", split, SPLITS)
@@ -96,6 +98,9 @@ def collect(path: Path, split: str = "test", window: int = 0) -> SkeletonRecord:
     assert windows.frame is not None
     trial = f"{experts.parameters['subject']:02d}_{windows.trial[window]:02d}"
     positions, first = windows.positions[window], int(windows.frame[window])
+    span = float(np.ptp(positions, axis=(0, 1)).max())
+    if span > FARTHEST:
+        raise InputError(f"{split} window {window} of {path} spans {span:.3g} units, too far to draw; choose another.")
     return SkeletonRecord(
         places=seen_from_the_side(positions),
         joints=experts.joints,
@@ -144,13 +149,19 @@ def seen_from_the_side(positions: Floats) -> Floats:
 
 
 def draw(record: SkeletonRecord) -> Figure:
-    """Draw one panel for each pose, all at one scale and as wide as the widest pose."""
+    """Draw one panel for each pose, all at one scale and as wide as the widest pose.
+
+    Raises InputError when the picture would be taller than TALLEST.
+    """
     poses = record.places[record.shown]
     half = max(float(np.ptp(pose[:, 0])) for pose in poses) / 2 + MARGIN
     heights = _heights(record)
     with style.sheet():
         scale = (style.COLUMN_WIDTH - 0.5) / len(poses) / (2 * half)  # inches per unit
-        figure = style.new_figure(height=scale * (heights[1] - heights[0]) + 0.87)
+        height = scale * (heights[1] - heights[0]) + 0.87
+        if height > TALLEST:
+            raise InputError(f"{record.split} window {record.window} is too tall for its width; choose another.")
+        figure = style.new_figure(height=height)
         figure.set_layout_engine("constrained", w_pad=0.01, h_pad=0.03, wspace=0, hspace=0)
         panels = figure.subplots(1, len(poses), sharey=True, squeeze=False)[0]
         for axes, step, pose in zip(panels, record.shown, poses, strict=True):
@@ -170,20 +181,9 @@ def draw(record: SkeletonRecord) -> Figure:
 def save_film(record: SkeletonRecord, path: Path) -> None:
     """Write an animated GIF of all the window's frames, with the provenance as its comment."""
     with style.sheet():
-        pictures = list(_film(record))
-    first, *rest = [picture.quantize(colors=64) for picture in pictures]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        first.save(
-            path,
-            save_all=True,
-            append_images=rest,
-            duration=round(1000 * STRIDE / (RATE * SPEED)),
-            loop=0,
-            comment=record.provenance.as_json(),
-        )
-    except OSError as error:
-        raise InputError(f"{path.parent} cannot be written: {error.strerror}; choose another folder.") from None
+        pictures = [picture.quantize(colors=64) for picture in _film(record)]
+    times = [round(1000 * STRIDE / (RATE * SPEED))] * len(pictures)
+    saving.save_film(pictures, path, times, record.provenance)
 
 
 def _film(record: SkeletonRecord) -> Iterator[Image.Image]:
@@ -237,7 +237,7 @@ def _draw_pose(axes: Axes, record: SkeletonRecord, pose: Floats, thickness: floa
                     lw=WIDTHS[name] * thickness,
                     solid_capstyle="round",
                     zorder=2 + order,
-                    gid=record.joints[joint],
+                    gid=printable(record.joints[joint]),
                 )
     if HEAD in record.joints:
         end = record.joints.index(HEAD)

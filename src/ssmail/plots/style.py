@@ -3,6 +3,7 @@
 Colours are those of Okabe and Ito (2008); methods differ by line style too, so that a grey print stays readable.
 """
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -18,6 +19,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import printable, shortened
 
 COLUMN_WIDTH = 3.4  # inches: one column of a two-column page
 RESOLUTION = 300  # dots per inch of a PNG
@@ -25,6 +27,7 @@ RESOLUTION = 300  # dots per inch of a PNG
 REFERENCE = "#222222"
 LANE = "#D4D4D4"
 REACH = 3.0
+_LABEL = 120  # characters
 AGENTS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 # The style sheet. Fonts: embedded as text in a PDF, as paths in an SVG. The salt makes SVG ids repeatable.
@@ -89,8 +92,12 @@ def strokes(labels: Sequence[str]) -> dict[str, Stroke]:
 
 @contextmanager
 def sheet() -> Iterator[None]:
-    """Draw and save within the style sheet, on top of matplotlib's own defaults and not of the user's settings."""
-    with matplotlib.rc_context():
+    """Draw and save within the style sheet, on top of matplotlib's own defaults and not of the user's settings.
+
+    Letters that the font lacks are drawn as boxes, without a warning for each.
+    """
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(SHEET)
         yield
@@ -101,6 +108,15 @@ def new_figure(height: float) -> Figure:
     figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def literal(text: str) -> str:
+    """Return a stored text as matplotlib has to get it, to show it as it is, on one line of bearable length.
+
+    Between two dollars matplotlib would read mathematics; a label that begins with _ it would leave out of the legend.
+    """
+    shown = shortened(printable(text), _LABEL).replace("$", r"\$")
+    return f" {shown}" if shown.startswith("_") else shown
 
 
 def log_axis(axes: Axes, limits: tuple[float, float]) -> None:

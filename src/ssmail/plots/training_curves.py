@@ -8,6 +8,7 @@ positive and they span more than a factor of SPAN.
 """
 
 import difflib
+import re
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -62,7 +63,7 @@ class TrainingRecord:
     @property
     def stem(self) -> str:
         """The files' name without ending: other metrics, other files."""
-        names = "_".join(panel.metric.replace("/", "-") for panel in self.panels)
+        names = "_".join(re.sub(r"[^A-Za-z0-9_.+=-]", "-", panel.metric) for panel in self.panels)
         return f"{NAME}_{names}"[:100]
 
     def table(self) -> pd.DataFrame:
@@ -218,7 +219,7 @@ def draw(record: TrainingRecord) -> Figure:
 
 
 def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> dict[str, Line2D]:
-    axes.set_ylabel(label(panel.metric))
+    axes.set_ylabel(label(style.literal(panel.metric)))
     if panel.logarithmic:
         style.log_axis(axes, curves.limits(panel.bands, ceiling=np.inf))
     else:

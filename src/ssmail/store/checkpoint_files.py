@@ -1,17 +1,24 @@
 """Checkpoint files beside a database: checking them against their record, and copying them in a merge."""
 
+import errno
 import hashlib
+import os
 import shutil
+import stat
 import uuid
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from ssmail.data.foreign_files import IrregularFileError, open_regular
 from ssmail.errors import InputError
 from ssmail.store.queries import ArtifactRow
+from ssmail.store.schema import is_run_id
 
 STAGING = ".merge-"
 """Prefix of the folder that holds copies until a merge needs them; a merge that is killed leaves it behind."""
+LARGEST = 8 * 2**30  # bytes of a checkpoint; those of the paper's sizes have a thousandth of it
+MOST_FILES = 16  # of a run; ssmail writes two
 
 
 def checkpoint_root_of(database: Path) -> Path:
@@ -19,15 +26,42 @@ def checkpoint_root_of(database: Path) -> Path:
     return database.parent / "checkpoints"
 
 
+def run_folder(root: Path, run_id: str) -> Path:
+    """Return the folder of a run's checkpoints. Every path that is made of an id is made here.
+
+    Raises InputError for an id that is not 32 hexadecimal digits, and for a folder that is a link: what lies behind it
+    may be anything.
+    """
+    if not is_run_id(run_id):
+        raise InputError(f"{run_id!r:.40} is no run id, so it has no checkpoints; `ssmail db check` names such runs")
+    folder = root / run_id
+    if folder.is_symlink():
+        raise InputError(f"{folder} is a link, which ssmail does not follow; put the folder itself in its place")
+    return folder
+
+
+def remove_folder(folder: Path) -> None:
+    """Delete a folder of checkpoints; links in it are deleted, not followed."""
+    shutil.rmtree(folder, ignore_errors=True)
+
+
 def fault_of(row: ArtifactRow) -> str | None:
-    """Return "missing" or "altered" for a file that is not as recorded, else None."""
+    """Return "missing", "altered" or "recorded in another folder" for a file that is not as recorded, else None.
+
+    Links are not followed, and pipes and devices not opened.
+    """
+    if row.path is None:
+        return "recorded in another folder"
     try:
-        if row.path.stat().st_size != row.size_bytes:
-            return "altered"
-        with row.path.open("rb") as file:
+        with open_regular(row.path, follow=False) as file:
+            size = os.fstat(file.fileno()).st_size
+            if row.path.parent.is_symlink() or size != row.size_bytes or size > LARGEST:
+                return "altered"
             return None if hashlib.file_digest(file, "sha256").hexdigest() == row.sha256 else "altered"
-    except OSError:
-        return "missing"
+    except IrregularFileError:
+        return "altered"
+    except OSError as error:
+        return "altered" if error.errno == errno.ELOOP else "missing"
 
 
 class CheckpointCopies:
@@ -46,25 +80,33 @@ class CheckpointCopies:
         self._creates_root = not target.exists()
 
     def stage(self, run_ids: Iterable[str]) -> None:
-        """Copy the existing folders of these runs to the staging folder, without partially written files."""
+        """Copy the existing files of these runs to the staging folder.
+
+        Only regular files are copied: no links, pipes, folders, partially written files, and none above LARGEST. Raises
+        InputError when a file cannot be copied.
+        """
         for run_id in run_ids:
-            folder = self.source / run_id
+            folder = run_folder(self.source, run_id)
             if self.shared or run_id in self.staged or not folder.is_dir():
                 continue
+            copies = run_folder(self._staging, run_id)
             try:
-                shutil.copytree(folder, self._staging / run_id, ignore=shutil.ignore_patterns("*.partial"))
-            except (OSError, shutil.Error) as error:
-                raise InputError(f"the checkpoints in {folder} cannot be copied to {self.target}: {error}") from error
+                copies.mkdir(parents=True)
+                for file in sorted(folder.iterdir())[:MOST_FILES]:
+                    _copy(file, copies / file.name)
+            except OSError as error:
+                reason = error.strerror or error
+                raise InputError(f"the checkpoints in {folder} cannot be copied to {self.target}: {reason}") from error
             self.staged.add(run_id)
 
     def place(self, run_ids: Iterable[str]) -> None:
         """Move the staged folders of these runs to their final path; existing folders are kept until `close`."""
         for run_id in self.staged.intersection(run_ids):
-            place = self.target / run_id
+            place = run_folder(self.target, run_id)
             if place.exists():
                 place.rename(self._replaced(run_id))
             self._placed.append(run_id)
-            (self._staging / run_id).rename(place)
+            run_folder(self._staging, run_id).rename(place)
             self.staged.discard(run_id)
 
     def commit(self) -> None:
@@ -75,14 +117,14 @@ class CheckpointCopies:
         """Remove the folders placed since the last `commit` and restore those that they replaced."""
         while self._placed:
             run_id = self._placed.pop()
-            shutil.rmtree(self.target / run_id, ignore_errors=True)
+            remove_folder(run_folder(self.target, run_id))
             if self._replaced(run_id).exists():
                 self._replaced(run_id).rename(self.target / run_id)
 
     def remove(self, run_ids: Iterable[str]) -> None:
         """Delete the folders of runs that are no longer in the target database."""
         for run_id in run_ids:
-            shutil.rmtree(self.target / run_id, ignore_errors=True)
+            remove_folder(run_folder(self.target, run_id))
 
     def close(self) -> None:
         """Delete the staging folder, and the checkpoint root if it was created for nothing."""
@@ -93,3 +135,12 @@ class CheckpointCopies:
 
     def _replaced(self, run_id: str) -> Path:
         return self._staging / f"old-{run_id}"
+
+
+def _copy(file: Path, target: Path) -> None:
+    """Copy a regular file that is not partially written; leave out anything else."""
+    if file.name.endswith(".partial") or not stat.S_ISREG(file.lstat().st_mode):
+        return
+    with open_regular(file, follow=False) as source, target.open("xb") as copy:
+        if os.fstat(source.fileno()).st_size <= LARGEST:
+            shutil.copyfileobj(source, copy)

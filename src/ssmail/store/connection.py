@@ -4,6 +4,7 @@ SQLite runs in WAL mode, so readers never wait. Writers take turns: each write t
 which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock.
 """
 
+import os
 import sqlite3
 import time
 from collections.abc import Iterator
@@ -14,10 +15,12 @@ from typing import Any
 from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, select, table, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.data.foreign_files import open_regular
+from ssmail.errors import InputError, SsmailError, masked, shortened
 from ssmail.store.schema import REVISIONS, metadata
 
 BUSY_SECONDS = 120.0
+_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # how a journal ends that names another file (SQLite's file format)
 _MIGRATIONS = Path(__file__).parent / "migrations"
 
 
@@ -39,7 +42,7 @@ def connect(where: str | Path) -> Engine:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
         raise InputError(
-            f"no driver for the database URL {_show(url)} is installed ({error}); install it with pip"
+            f"no driver for the database URL {name_of(url)} is installed ({error}); install it with pip"
         ) from error
     try:
         with explained_errors(describe(engine)):
@@ -71,7 +74,7 @@ def writing(engine: Engine) -> Iterator[Connection]:
 
 def describe(engine: Engine) -> str:
     """Return the database's path, or its URL without the password, for messages."""
-    return _show(engine.url)
+    return name_of(engine.url)
 
 
 def as_url(where: str | Path) -> URL:
@@ -83,12 +86,15 @@ def as_url(where: str | Path) -> URL:
         return _file_url(Path(where).expanduser())
     try:
         url = make_url(where)
-    except ArgumentError as error:
-        raise InputError(f"{where!r} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from error
+    except (ArgumentError, ValueError):
+        shown = shortened(masked(where), 100)
+        raise InputError(f"{shown} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from None
     if url.get_backend_name() != "sqlite":
         return url
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
-        raise InputError(f"{where!r} is not a file on disk, which ssmail needs; give the path of a file")
+        raise InputError(
+            f"{shortened(masked(where), 100)} is not a file on disk, which ssmail needs; give the path of a file"
+        )
     return _file_url(Path(str(url.database)))
 
 
@@ -96,12 +102,14 @@ def make_engine(url: URL) -> Engine:
     """Return an engine with ssmail's settings, without checking or upgrading the database."""
     if url.get_backend_name() != "sqlite":
         return create_engine(url, isolation_level="SERIALIZABLE")
+    _refuse_journal(Path(str(url.database)))
     engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
 
     @event.listens_for(engine, "connect")
     def _configure(dbapi_connection: Any, _record: Any) -> None:
         dbapi_connection.isolation_level = None  # keeps the driver from starting transactions; `_begin` does
         dbapi_connection.execute("PRAGMA foreign_keys = ON")
+        dbapi_connection.execute("PRAGMA trusted_schema = OFF")
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -116,6 +124,8 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
 
     Raises InputError for a database of another program or of a newer ssmail.
     """
+    if engine.dialect.name == "sqlite":
+        _refuse_program(connection, describe(engine))
     tables = set(inspect(connection).get_table_names())
     if not tables:
         return None
@@ -129,6 +139,40 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
             f"to {REVISIONS[-1]}); upgrade ssmail or use another database"
         )
     return str(revision)
+
+
+def _refuse_program(connection: Connection, where: str) -> None:
+    """Raise InputError if an SQLite file computes anything when it is read or written.
+
+    That is a view or a virtual table in place of a table, a trigger, or a generated column; ssmail makes none of them.
+    """
+    objects = "SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index') OR rootpage = 0"
+    columns = (
+        "SELECT m.name FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE m.type = 'table' AND c.hidden"
+    )
+    found = connection.exec_driver_sql(f"{objects} UNION ALL {columns} LIMIT 1").scalar()
+    if found is not None:
+        raise InputError(
+            f"{where} holds {str(found)!r:.40}, a view, trigger or computed column, which ssmail never makes; do not "
+            "use this file"
+        )
+
+
+def _refuse_journal(file: Path) -> None:
+    """Raise InputError if a rollback journal names another file, which SQLite may delete when it rolls back.
+
+    It does so in transactions over several databases, of which ssmail has none.
+    """
+    try:
+        with open_regular(file.with_name(f"{file.name}-journal")) as journal:
+            journal.seek(-min(len(_JOURNAL), os.fstat(journal.fileno()).st_size), os.SEEK_END)
+            names_another = journal.read(len(_JOURNAL)) == _JOURNAL
+    except FileNotFoundError:
+        return
+    except OSError:
+        names_another = True
+    if names_another:
+        raise InputError(f"{file}-journal is not a journal that ssmail leaves behind; do not use these two files")
 
 
 @contextmanager
@@ -154,16 +198,19 @@ def explained(reason: str, where: str) -> SsmailError:
     return SsmailError(f"an operation on the database {where} failed: {reason}")
 
 
-def _show(url: URL) -> str:
+def name_of(url: URL) -> str:
+    """Return the path of an SQLite database, or the URL of another without passwords, for messages."""
     if url.get_backend_name() == "sqlite" and url.database:
         return url.database
-    return url.render_as_string(hide_password=True)
+    return masked(url.render_as_string(hide_password=True))
 
 
 def _file_url(path: Path) -> URL:
     path = path.absolute()
     if path.is_dir():
         raise InputError(f"{path} is a folder; give the path of the database file, such as {path / 'ssmail.db'}")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is a pipe or a device; give the path of a file")
     return URL.create("sqlite", database=str(path))
 
 

@@ -1,6 +1,7 @@
 """Rows of runs and artifacts, and the queries on an open connection that the Store shares with maintenance."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -86,11 +87,14 @@ class RunRow:
 
 @dataclass(frozen=True)
 class ArtifactRow:
-    """A file that a run recorded. `path` is absolute; the file may have been deleted since."""
+    """A file that a run recorded. `path` is absolute; the file may have been deleted since.
+
+    It is None if what is stored is not the path of a file in the run's own folder: no other file is ever touched.
+    """
 
     run_id: str
     name: str
-    path: Path
+    path: Path | None
     sha256: str
     size_bytes: int
 
@@ -145,7 +149,15 @@ def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[
 
 
 def artifacts(connection: Connection, run_id: str, root: Path) -> list[ArtifactRow]:
-    """Return the run's files, by name; relative paths are resolved against `root`."""
+    """Return the run's files, by name; `root` is the checkpoint root."""
     table = schema.artifact
     query = select(table).where(table.c.run_id == run_id).order_by(table.c.name)
-    return [ArtifactRow(**{**row, "path": root / row["path"]}) for row in connection.execute(query).mappings()]
+    rows = connection.execute(query).mappings()
+    return [ArtifactRow(**{**row, "path": _file_of_run(root, run_id, row["path"])}) for row in rows]
+
+
+def _file_of_run(root: Path, run_id: str, stored: object) -> Path | None:
+    """Return the path of a recorded file, "RUN_ID/NAME" below the checkpoint root; None for anything else."""
+    folder, _, name = str(stored).partition("/")
+    plain = schema.is_run_id(run_id) and folder == run_id and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name)
+    return root / run_id / name if plain else None

@@ -1,6 +1,5 @@
 """The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
-import shutil
 import uuid
 from collections.abc import Iterable, Sequence
 from copy import copy
@@ -14,7 +13,7 @@ from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import arrays, queries, run_metadata, schema
-from ssmail.store.checkpoint_files import checkpoint_root_of
+from ssmail.store.checkpoint_files import checkpoint_root_of, remove_folder, run_folder
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.schema import RunState
@@ -195,8 +194,8 @@ class Store:
             for run_id in full:
                 self.require_idle(queries.one_run(connection, run_id))
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
-        for run_id in full:
-            shutil.rmtree(self.checkpoint_root / run_id, ignore_errors=True)
+        for run_id in filter(schema.is_run_id, full):
+            remove_folder(run_folder(self.checkpoint_root, run_id))
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 

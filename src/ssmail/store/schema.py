@@ -1,5 +1,6 @@
 """The tables of the store; docs/database.md explains each column. Every change here needs an Alembic revision."""
 
+import re
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
@@ -9,6 +10,23 @@ from sqlalchemy.types import TypeDecorator
 
 REVISIONS = ("0001",)
 """All schema revisions that this version of ssmail knows, oldest first; it reads and writes the last one."""
+
+
+def is_run_id(value: object) -> bool:
+    """Return whether a value is a run id: 32 hexadecimal digits in lower case. Only such an id may become a path."""
+    return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{32}", value) is not None
+
+
+def hexadecimal(column: str) -> tuple[sa.CheckConstraint, ...]:
+    """Return constraints by which the database, SQLite or PostgreSQL, refuses other values than run ids in a column.
+
+    Databases made by earlier versions, or by someone else, need not have them, so readers check ids too.
+    """
+    conditions = {
+        "sqlite": f"length({column}) = 32 AND {column} NOT GLOB '*[^0-9a-f]*'",
+        "postgresql": f"{column} ~ '^[0-9a-f]{{32}}$'",
+    }
+    return tuple(sa.CheckConstraint(words).ddl_if(dialect=name) for name, words in conditions.items())
 
 
 class RunState(StrEnum):
@@ -75,6 +93,7 @@ run = sa.Table(
     sa.Column("cpu_seconds", sa.Float, nullable=False),
     sa.Column("peak_memory_bytes", sa.BigInteger),
     sa.Index("run_cell", "spec_hash", "seed"),
+    *hexadecimal("id"),
 )
 
 

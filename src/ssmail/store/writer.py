@@ -18,6 +18,7 @@ from sqlalchemy.exc import IntegrityError
 
 from ssmail.errors import SsmailError
 from ssmail.store import arrays, run_metadata, schema
+from ssmail.store.checkpoint_files import run_folder
 from ssmail.store.connection import writing
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import RunState
@@ -26,7 +27,8 @@ from ssmail.store.schema import RunState
 class RunWriter:
     """Records one run. Get a RunWriter from Store.start_run or Store.resume_run.
 
-    resumed: the run's row before this process resumed it; the resources in it are added to those of this process.
+    folder: for the run's files; it need not exist yet. resumed: the run's row before this process resumed it; the
+    resources in it are added to those of this process.
     """
 
     def __init__(
@@ -34,7 +36,7 @@ class RunWriter:
     ) -> None:
         self.run_id = run_id
         self._engine = engine
-        self._checkpoint_root = checkpoint_root
+        self.folder = run_folder(checkpoint_root, run_id)
         self._owner = owner
         # clock readings at which this run's wall and CPU time would have been zero
         self._wall_start = time.monotonic() - (resumed.wall_seconds if resumed else 0.0)
@@ -69,16 +71,12 @@ class RunWriter:
         rows = [{"run_id": self.run_id, "name": name, **arrays.encode(value)} for name, value in values.items()]
         self._replace(schema.array, rows)
 
-    def artifact(self, name: str, path: Path) -> None:
-        """Record the file at `path` under `name` with its SHA-256; make paths below the checkpoint root relative."""
-        content = path.read_bytes()
-        try:
-            stored = path.resolve().relative_to(self._checkpoint_root.resolve())
-        except ValueError:
-            stored = path.resolve()
-        digest = hashlib.sha256(content).hexdigest()
-        row = {"name": name, "path": stored.as_posix(), "sha256": digest, "size_bytes": len(content)}
-        self._replace(schema.artifact, [{"run_id": self.run_id, **row}])
+    def artifact(self, name: str, file: str | None = None) -> None:
+        """Record a file of the run's folder under `name`, by default the file of that name, with its SHA-256."""
+        file = file or name
+        content = (self.folder / file).read_bytes()
+        row = {"name": name, "path": f"{self.run_id}/{file}", "size_bytes": len(content)}
+        self._replace(schema.artifact, [{"run_id": self.run_id, **row, "sha256": hashlib.sha256(content).hexdigest()}])
 
     def finish(self, state: RunState, error: str | None = None) -> None:
         """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards."""

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.data.mocap import dataset
 from ssmail.data.mocap.amc import parse_motion
 from ssmail.data.mocap.dataset import MocapParameters, parse_trials, prepare
 from ssmail.data.mocap.kinematics import positions
@@ -111,6 +112,29 @@ def test_too_short_and_motionless_trials(folder: Path) -> None:
         (folder / f"35_{trial:02d}.amc").write_bytes(amc(*[still] * 9))
     with pytest.raises(InputError, match="nothing moves in the training trials"):
         prepare(folder, WANTED)
+
+
+def test_more_frames_than_fit_into_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each trial alone may be small enough."""
+    folder = write_subject(tmp_path / "subject", {1: 60, 2: 60, 3: 60, 4: 60})
+    wanted = WANTED.model_copy(update={"train": (1, 2), "validation": (3,), "test": (4,)})
+    monkeypatch.setattr(dataset, "MOST_PLACES", 600)  # 60 frames of 5 joints, twice
+    prepare(folder, wanted)
+    monkeypatch.setattr(dataset, "MOST_PLACES", 599)
+    with pytest.raises(
+        InputError, match=r"35_02\.amc and those before it have too many frames for one set; name fewer"
+    ):
+        prepare(folder, wanted)
+
+
+def test_trials_of_different_size(tmp_path: Path) -> None:
+    """A test trial in metres, as if the others were in micrometres."""
+    folder = write_subject(tmp_path / "subject", {1: 60, 2: 60, 3: 60})
+    far = {"root": (1e9, 0, 0, 0, 0, 0), "spine": (0, 0, 0), "lleg": (0, 0), "lfoot": (0,)}
+    (folder / "35_03.amc").write_bytes(amc(*[far] * 60))
+    wanted = WANTED.model_copy(update={"train": (1,), "validation": (2,), "test": (3,)})
+    with pytest.raises(InputError, match="differ too much in size to be scaled alike"):
+        prepare(folder, wanted)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """The download, against a site on this machine that misbehaves in every way we could think of."""
 
+import gzip
+import hashlib
 import multiprocessing
 import os
 import signal
@@ -118,12 +120,42 @@ def test_a_wrong_digest_is_refused_and_not_kept(fetch: Fetch, site: Site, tmp_pa
     good = site.files["/subjects/35/35_01.amc"]
     site.files["/subjects/35/35_01.amc"] = MOTION.replace(b"17.9", b"18.0")
     with pytest.raises(
-        SsmailError, match=r"35_01\.amc is not the file that ssmail knows \(its SHA-256 differs\); .*sou"
+        SsmailError,
+        match=r"35_01\.amc is not the file that ssmail knows \(its SHA-256 differs\) and was deleted; .*sou",
     ):
         fetch()
     assert [path.name for path in (tmp_path / "cache/35").iterdir()] == ["35.asf"]
     site.files["/subjects/35/35_01.amc"] = good
     assert_whole(fetch(), site)
+
+
+def test_the_digest_of_a_file_that_nobody_knows_is_reported(fetch: Fetch, site: Site) -> None:
+    site.files |= {"/subjects/36/36.asf": SKELETON, "/subjects/36/36_01.amc": MOTION}
+    said: list[str] = []
+    fetch([1], said, subject=36)
+    digests = [hashlib.sha256(contents).hexdigest() for contents in (SKELETON, MOTION)]
+    assert said[2:] == [
+        f"36.asf: 0 kB, SHA-256 {digests[0]} [1/2]",
+        f"36_01.amc: 7 kB, SHA-256 {digests[1]} [2/2]",
+    ]
+
+
+def test_a_file_that_comes_compressed_is_refused(fetch: Fetch, site: Site) -> None:
+    """Unpacked, it may have any size."""
+    site.misbehaves("35.asf", status(200, gzip.compress(SKELETON), Content_Encoding="gzip"))
+    with pytest.raises(SsmailError, match=r"35\.asf comes compressed, which nobody asked for; run the same"):
+        fetch()
+
+
+def test_temporary_files_of_killed_downloads_are_deleted_after_a_day(fetch: Fetch, site: Site, tmp_path: Path) -> None:
+    folder = tmp_path / "cache" / "35"
+    folder.mkdir(parents=True)
+    for name in ("tmpabcd_123", "tmpabcd_124", "tmpother"):
+        (folder / name).write_text("half")
+        if name != "tmpabcd_124":
+            os.utime(folder / name, (0, 0))
+    fetch()
+    assert sorted(path.name for path in folder.iterdir()) == [*NAMES, "tmpabcd_124", "tmpother"]
 
 
 def test_a_file_that_was_changed_in_the_cache_is_downloaded_again(fetch: Fetch, site: Site) -> None:
@@ -137,8 +169,6 @@ def test_a_file_that_was_changed_in_the_cache_is_downloaded_again(fetch: Fetch, 
 
 @pytest.mark.skipif(not CMU, reason="SSMAIL_CMU_DIR does not name a folder with CMU's subject 35")
 def test_the_known_digests_are_those_of_the_real_files() -> None:
-    import hashlib
-
     folder = Path(str(CMU))
     found = {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.glob("35*.a[sm][fc]")}
     assert found == download.SHA256

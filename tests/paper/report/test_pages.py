@@ -77,7 +77,7 @@ def test_a_diverged_run_and_one_that_failed_are_told(written: Written) -> None:
     assert "seed 1: diverged" in words
     assert "wail, seed 3 failed: <b>out of memory</b> | killed" in words  # as text
     assert "<b>out of memory" not in written.html
-    assert "- wail, seed 3 failed: <b>out of memory</b>" in written.markdown
+    assert r"- wail, seed 3 failed: \<b\>out of memory\</b\> \| killed" in written.markdown
     assert "Not drawn: there is no data/mocap.npz." in words
 
 

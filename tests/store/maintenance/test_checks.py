@@ -1,6 +1,7 @@
 """A sound database has no problem; every kind of damage is found, alone, with its remedy."""
 
 import re
+import shlex
 import shutil
 import sqlite3
 from collections.abc import Callable
@@ -56,7 +57,7 @@ def test_the_checkpoint_of_a_run_at_work_may_change(store: Store) -> None:
     path = store.checkpoint_root / writer.run_id / "last.pt"
     path.parent.mkdir(parents=True)
     path.write_bytes(b"one")
-    writer.artifact("last.pt", path)
+    writer.artifact("last.pt")
     path.write_bytes(b"two")
     assert check(store.where) == []
     writer.finish(RunState.INTERRUPTED)
@@ -186,11 +187,39 @@ def test_the_remedies_for_orphans_and_stale_runs_help(filled: Path) -> None:
         f"1 row belongs to no run in the table {table}" for table in ("metric", "metric_latest")
     ]
     for problem in orphans:
-        change(filled, problem.remedy.split('"')[1])
+        _, _, statement = shlex.split(problem.remedy.split("`")[1])
+        change(filled, statement)
     opened = Store.open(filled)
     opened.mark_stale()
     opened.close()
     assert check(filled) == []
+
+
+def test_a_table_of_someone_else_gets_no_command(filled: Path) -> None:
+    change(filled, 'CREATE TABLE "run; rm -r ~" (run_id TEXT REFERENCES run (id))')
+    change(filled, "INSERT INTO \"run; rm -r ~\" VALUES ('gone')")
+    (problem,) = check(filled)
+    assert problem.check == "orphans"
+    assert "`" not in problem.remedy
+
+
+@pytest.mark.parametrize("name", ["a b", "a; touch gone", "a' $(touch gone)"])
+def test_a_remedy_is_one_command_whatever_the_folder_is_called(name: str, filled: Path, tmp_path: Path) -> None:
+    database = tmp_path / name / "results" / "ssmail.db"
+    shutil.copytree(filled.parent, database.parent)
+    folder = database.parent / "checkpoints" / ("a" * 32)
+    folder.mkdir(parents=True)
+    (problem,) = check(database)
+    command = problem.remedy.split("`")[1]
+    assert shlex.split(command) == ["rm", "-r", str(folder)]
+
+
+def test_a_folder_that_cannot_be_printed_is_not_in_a_command(filled: Path, tmp_path: Path) -> None:
+    database = tmp_path / "a\x1b[2Jb" / "results" / "ssmail.db"
+    shutil.copytree(filled.parent, database.parent)
+    (database.parent / "checkpoints" / ("a" * 32)).mkdir(parents=True)
+    (problem,) = check(database)
+    assert problem.remedy == "delete the folder: `rm -r ...`"
 
 
 def test_checkpoints_of_another_database_in_the_folder_are_no_strays(filled: Path) -> None:
@@ -230,8 +259,11 @@ def test_a_truncated_file_is_told(filled: Path) -> None:
 def test_an_empty_file_has_no_tables_yet(tmp_path: Path) -> None:
     (tmp_path / "empty.db").touch()
     (problem,) = check(tmp_path / "empty.db")
-    assert (problem.check, problem.problem) == ("schema", "it has no tables yet")
-    assert "ssmail db upgrade" in problem.remedy
+    assert problem.check == "schema"
+    assert problem.problem.startswith("it has no tables yet")
+    assert "the next command that opens it makes them" in problem.remedy
+    Store.open(tmp_path / "empty.db").close()
+    assert check(tmp_path / "empty.db") == []
 
 
 def test_what_is_no_database_of_ssmails_is_refused(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_a_run_that_was_continued_elsewhere_comes_back_with_its_checkpoint(here:
     writer.epoch(2, {"validation/mode_mse": 0.2, "actor/loss": 0.0})
     (there.checkpoint_root / run_id / "last.pt").write_bytes(b"further")
     writer.final(2, {"test/mode_mse": 0.1})
-    writer.artifact("last.pt", there.checkpoint_root / run_id / "last.pt")
+    writer.artifact("last.pt")
     writer.finish(FINISHED)
     assert fates(here, there) == [Fate.REPLACED]
     assert contents(here.where) == contents(there.where)

@@ -8,6 +8,7 @@ from ssmail.errors import InputError
 
 LARGEST = 1e9  # the largest number that a file may contain
 LONGEST = 10_000  # the longest line, in characters
+LONGEST_NAME = 100  # the longest name of a joint, in characters
 AGAIN = "get the file again from its source"
 
 
@@ -27,6 +28,11 @@ class Line:
 def quoted(word: str) -> str:
     """Quote a word of a file for a message: printable and not too long."""
     return repr(word if len(word) <= 24 else word[:21] + "...")
+
+
+def is_name(word: str) -> bool:
+    """Return whether a joint can be called so."""
+    return 0 < len(word) <= LONGEST_NAME and word.isprintable()
 
 
 def read_lines(contents: bytes, file: str) -> list[str]:

@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from ssmail.data.mocap.acclaim_lines import AGAIN, Line, number, quoted, read_lines
+from ssmail.data.mocap.acclaim_lines import AGAIN, LONGEST_NAME, Line, is_name, number, quoted, read_lines
 from ssmail.errors import InputError
 
 ROOT = "root"
@@ -173,6 +173,8 @@ def _bones(section: Sequence[Line], scale: float) -> dict[str, tuple[Bone, Line]
         name = line.words[1]
         if name.lower() == ROOT:
             raise line.fault("a bone is called root, but the root is no bone")
+        if not is_name(name):
+            raise line.fault(f"{quoted(name)} is longer than {LONGEST_NAME} characters, or not printable")
         if name in bones:
             raise line.fault(f"bone {quoted(name)} is there twice, first in line {bones[name][1].number}")
         if len(bones) == MOST_BONES:

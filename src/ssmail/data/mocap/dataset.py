@@ -19,7 +19,7 @@ from pydantic import Field
 
 from ssmail.config.sections import Frozen
 from ssmail.data.mocap.acclaim_lines import AGAIN
-from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.amc import MOST_PLACES, parse_motion
 from ssmail.data.mocap.asf import Skeleton, parse_skeleton
 from ssmail.data.mocap.kinematics import positions
 from ssmail.data.mocap.source import Source, find_subject, open_source, shown
@@ -106,6 +106,8 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
         _ = experts.scaling
     except ValueError:
         raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
+    if not experts.is_scalable:
+        raise InputError(f"the trials in {source} differ too much in size to be scaled alike; {AGAIN}")
     return experts
 
 
@@ -132,6 +134,7 @@ def _split(
     parts: list[tuple[Floats, Floats]] = []
     trials: list[int] = []
     frames: list[int] = []
+    places = 0
     for trial, name in names.items():
         label = _label(files, name)
         motion = parse_motion(_read(files, name, sources), label, skeleton)
@@ -140,6 +143,9 @@ def _split(
                 f"{label} has {len(motion)} frames, too few for a window of {window} and one before it; "
                 f"leave trial {trial:02d} out"
             )
+        places += motion.angles.shape[0] * motion.angles.shape[1]
+        if places > MOST_PLACES:
+            raise InputError(f"{label} and those before it have too many frames for one set; name fewer trials")
         placed = positions(skeleton, motion)  # (F, N, 3)
         starts = range(0, len(motion) - window, window)
         index = np.add.outer(starts, np.arange(window))  # (windows, window)

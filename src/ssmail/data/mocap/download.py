@@ -1,14 +1,16 @@
 """Download of a subject from the CMU motion capture database into a local cache, with pooch.
 
 The site asks not to be crawled, so there is one connection at a time, a pause between files, and no request for a file
-that is already in the cache. A file is checked before it gets its name in the cache: against its SHA-256 where the
-package knows it (cmu_sha256.txt: the trials of subject 35 that the paper uses), else against its first bytes.
+that is already in the cache. It speaks plain HTTP only, so anyone on the way could change a file. A file is checked
+before it gets its name in the cache: against its SHA-256 where the package knows it (cmu_sha256.txt: the trials of
+subject 35 that the paper uses), else against its first bytes, and its SHA-256 is reported.
 """
 
 import re
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +18,7 @@ import pooch
 import requests
 
 from ssmail import __version__
+from ssmail.data.atomic_file import PATIENCE
 from ssmail.data.mocap.source import LARGEST
 from ssmail.errors import InputError, SsmailError
 
@@ -67,6 +70,7 @@ def fetch(
         retry_if_failed=attempts - 1,  # pooch waits 1 s before the second attempt, 2 s before the third, ...
     )
     pooch.get_logger().setLevel("WARNING")  # pooch's progress would repeat what `report` gets
+    _delete_leftovers(folder)
     missing = [name for name in names if not _is_cached(folder / name)]
     if len(missing) < len(names):
         report(f"{len(names) - len(missing)} of {len(names)} files are in {folder} already")
@@ -74,14 +78,23 @@ def fetch(
         if count > 1:
             time.sleep(pause_seconds)
         try:
-            size = _fetch_file(site, name, timeout_seconds).stat().st_size
+            path = _fetch_file(site, name, timeout_seconds)
         except AbsentError:
             if not allow_missing or name == names[0]:
                 raise
             report(f"{name}: not there [{count}/{len(missing)}]")
         else:
-            report(f"{name}: {size / 1000:.0f} kB [{count}/{len(missing)}]")
+            digest = "" if name in SHA256 else f", SHA-256 {pooch.file_hash(path)}"
+            report(f"{name}: {path.stat().st_size / 1000:.0f} kB{digest} [{count}/{len(missing)}]")
     return folder
+
+
+def _delete_leftovers(folder: Path) -> None:
+    """Delete the temporary files of pooch that killed downloads left behind."""
+    for path in folder.glob("tmp????????"):
+        with suppress(OSError):
+            if time.time() - path.lstat().st_mtime > PATIENCE:
+                path.unlink()
 
 
 def _is_cached(path: Path) -> bool:
@@ -97,7 +110,9 @@ def _fetch_file(site: pooch.Pooch, name: str, timeout: float) -> Path:
     except requests.RequestException as error:
         raise SsmailError(f"{url} could not be downloaded: {_reason(error, timeout)}; {REMEDY}") from None
     except ValueError:  # the last attempt brought a file with another digest
-        raise SsmailError(f"{url} is not the file that ssmail knows (its SHA-256 differs); {REMEDY}") from None
+        raise SsmailError(
+            f"{url} is not the file that ssmail knows (its SHA-256 differs) and was deleted; {REMEDY}"
+        ) from None
     except OSError as error:
         raise InputError(
             f"cannot use the cache {site.path}: {error.strerror or error}; choose another --cache"
@@ -120,6 +135,8 @@ def _stream(url: str, output: str, _: pooch.Pooch, *, timeout: float) -> None:
             raise SsmailError(f"{url} could not be downloaded: the server answered {status}; {REMEDY}")
         if not {"content-length", "transfer-encoding"} & {key.lower() for key in response.headers}:
             raise SsmailError(f"{url} comes without its length, so a cut connection would not be noticed; {REMEDY}")
+        if response.headers.get("Content-Encoding", "identity") != "identity":
+            raise SsmailError(f"{url} comes compressed, which nobody asked for; {REMEDY}")
         with path.open("wb") as file:
             for chunk in response.iter_content(2**16):
                 if not file.tell() and not BEGINNING.match(chunk):

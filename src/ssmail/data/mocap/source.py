@@ -1,22 +1,22 @@
 """Find and read the files of a subject, anywhere below a folder or inside a zip file.
 
-Members of a zip file are read into memory, up to a limit, and never unpacked: no member can write outside its folder or
-grow without bounds.
+Members of a zip file are read into memory, up to a limit, and never unpacked (see foreign_files).
 """
 
 import os
 import re
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
+from ssmail.data.foreign_files import ARCHIVE_ERRORS, IrregularFileError, is_plain, open_regular, read_whole
 from ssmail.errors import InputError
 
 LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes; the files of subject 35 have 7 kB and 0.5 MB
+LONGEST_SHOWN = 120  # characters of a name in a message
 
 
 @dataclass(frozen=True)
@@ -25,21 +25,24 @@ class _Folder:
 
     def names(self) -> Iterator[str]:
         def refuse(error: OSError) -> None:
-            raise InputError(f"{error.filename} cannot be read: {error.strerror}; choose another --source")
+            raise InputError(f"{shown(error.filename)} cannot be read: {error.strerror}; choose another --source")
 
-        for folder, _, files in os.walk(self.path, onerror=refuse):
-            below = Path(folder).relative_to(self.path)
-            yield from ((below / file).as_posix() for file in files)
+        try:
+            for folder, _, files in os.walk(self.path, onerror=refuse):
+                below = Path(folder).relative_to(self.path)
+                yield from ((below / file).as_posix() for file in files)
+        except RecursionError:
+            raise InputError(f"the folders in {self.path} are nested too deeply; choose another --source") from None
 
     def read(self, name: str) -> bytes:
-        path = self.path / name
+        label = shown(str(self.path / name))
         try:
-            if not path.is_file():  # a pipe would block
-                raise InputError(f"{shown(str(path))} is not a file; put the file there")
-            with path.open("rb") as file:
-                return _whole(file, name, shown(str(path)))
+            with open_regular(self.path / name) as file:
+                return _whole(file, name, label)
+        except (IrregularFileError, FileNotFoundError):
+            raise InputError(f"{label} is not a file; put the file there") from None
         except OSError as error:
-            raise InputError(f"{shown(str(path))} cannot be read: {error.strerror}; check its permissions") from None
+            raise InputError(f"{label} cannot be read: {error.strerror}; check its permissions") from None
 
 
 @dataclass(frozen=True)
@@ -48,16 +51,19 @@ class _Archive:
     archive: zipfile.ZipFile
 
     def names(self) -> Iterator[str]:
-        return (member.filename for member in self.archive.infolist() if not member.is_dir())
+        return (name for name in self.archive.namelist() if not name.endswith("/"))
 
     def read(self, name: str) -> bytes:
-        label = f"{shown(name)} in {self.path}"
+        label = shown(f"{shown(name)} in {self.path}")
+        member = self.archive.getinfo(name)
+        if not is_plain(member):
+            raise InputError(f"{label} is encrypted or packed in an unusual way; pack it plainly")
         try:
-            with self.archive.open(name) as file:
+            with self.archive.open(member) as file:
                 return _whole(file, name, label)
-        except RuntimeError:  # zipfile's word for a password; NotImplementedError, for an exotic method, is one too
+        except NotImplementedError:
             raise InputError(f"{label} is encrypted or packed in an unusual way; pack it plainly") from None
-        except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError):
+        except ARCHIVE_ERRORS:
             raise InputError(f"{label} is damaged; get the zip file again") from None
 
 
@@ -75,19 +81,20 @@ class Subject:
 @contextmanager
 def open_source(path: Path) -> Iterator[Source]:
     """Open the folder or zip file at `path`. Raises InputError if it is neither, or cannot be read."""
-    if path.is_dir():
-        yield _Folder(path)
-        return
-    if not path.exists():
-        raise InputError(f"there is no {path}; --source takes a folder or a zip file with the .asf and .amc files")
-    try:
-        if not path.is_file():  # a pipe would block
-            raise zipfile.BadZipFile
-        archive = zipfile.ZipFile(path)
-    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError):
-        raise InputError(f"{path} is neither a folder nor a readable zip file; --source takes one of them") from None
-    with archive:
-        yield _Archive(path, archive)
+    with ExitStack() as stack:
+        source: Source
+        try:
+            if path.is_dir():
+                source = _Folder(path)
+            else:
+                source = _Archive(path, stack.enter_context(zipfile.ZipFile(stack.enter_context(open_regular(path)))))
+        except FileNotFoundError:
+            remedy = "--source takes a folder or a zip file with the .asf and .amc files"
+            raise InputError(f"there is no {path}; {remedy}") from None
+        except ARCHIVE_ERRORS:
+            remedy = "--source takes one of them"
+            raise InputError(f"{path} is neither a folder nor a readable zip file; {remedy}") from None
+        yield source
 
 
 def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject:
@@ -115,14 +122,15 @@ def find_subject(source: Source, subject: int, trials: Iterable[int]) -> Subject
 
 
 def shown(name: str) -> str:
-    """Format a name for a message, on one line."""
-    return name if name.isprintable() else repr(name)
+    """Format a name for a message, on one line and not too long."""
+    name = name if name.isprintable() else repr(name)
+    return name if len(name) <= LONGEST_SHOWN else f"{name[: LONGEST_SHOWN // 2]}...{name[3 - LONGEST_SHOWN // 2 :]}"
 
 
 def _whole(file: IO[bytes], name: str, label: str) -> bytes:
     """Read a file whole. Raises InputError if it is larger than LARGEST for its kind; `label` names it there."""
     largest = LARGEST[name[-4:].lower()]
-    contents = file.read(largest + 1)
-    if len(contents) > largest:
+    contents = read_whole(file, largest)
+    if contents is None:
         raise InputError(f"{label} is larger than {largest >> 20} MB, so it is no file of the database; remove it")
-    return contents
+    return bytes(contents)

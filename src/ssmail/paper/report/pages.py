@@ -1,8 +1,9 @@
 """Write a report as one self-contained HTML page, and as Markdown that links to the saved figures."""
 
 import os
+import re
 from base64 import b64encode
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -13,7 +14,7 @@ from markupsafe import Markup
 
 from ssmail import __version__
 from ssmail.data.atomic_file import atomic_write
-from ssmail.errors import InputError
+from ssmail.errors import InputError, printable
 from ssmail.paper.claims import Verdict
 from ssmail.paper.report.contents import Report, samples_of
 from ssmail.paper.report.drawing import Drawn
@@ -23,6 +24,10 @@ from ssmail.store import RunRow
 MARKDOWN, HTML = "report.md", "report.html"
 TEMPLATES = Path(__file__).with_name("templates")
 INLINE = (".png", ".svg")  # formats that Markdown viewers display
+SPECIAL = re.compile(r"[\\`*\[\]<>|~$]|&(?=[#\w])|(?<![^\W_])_|_(?![^\W_])")
+"""What means something to Markdown in the middle of a line; a backslash before it takes that away."""
+BLOCK = re.compile(r"^(\s*\d*)([-+=.)])(?=[\s=-]|$)|^(\s*)(#)")
+"""What begins a list, a rule or a heading where it begins a line; a minus before a number is none."""
 SIGNS = {Verdict.SUPPORTED: "✓", Verdict.CONTRADICTED: "✗", Verdict.INCONCLUSIVE: "?"}
 
 
@@ -43,24 +48,59 @@ def write(report: Report, folder: Path) -> list[Path]:
 
 
 def html(report: Report) -> str:
-    """Render the HTML page, with style, script and figures inline."""
+    """Render the HTML page, with style, script and figures inline. Every other text is made printable and escaped."""
     parts = {name: Markup((TEMPLATES / f"report.{name}").read_text(encoding="utf-8")) for name in ("css", "js")}
-    return _environment(autoescape=True).get_template("report.html.j2").render(report=report, **parts)
+    environment = _environment(autoescape=True, finalize=_for_html)
+    return environment.get_template("report.html.j2").render(report=report, **parts)
 
 
 def markdown(report: Report, folder: Path) -> str:
-    """Render the report as Markdown, without whole specs. Paths of figures are relative to `folder`."""
+    """Render the report as Markdown, without whole specs. Paths of figures are relative to `folder`.
 
-    def path(drawn: Drawn) -> str:
+    Every text that the template inserts is escaped, so none from a database is read as Markdown or HTML. Only a bare
+    address may become a link to what it says, in viewers that look for those.
+    """
+
+    def path(drawn: Drawn) -> _Markdown:
         return _relative(drawn, folder)
 
-    return _environment(autoescape=False).get_template("report.md.j2").render(report=report, path=path)
+    environment = _environment(autoescape=False, finalize=_for_markdown)
+    return environment.get_template("report.md.j2").render(report=report, path=path)
 
 
-def _environment(autoescape: bool) -> Environment:
+class _Markdown(str):
+    """A text that is Markdown already."""
+
+
+def _for_html(value: Any) -> Any:
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def _for_markdown(value: Any) -> Any:
+    if not isinstance(value, str) or isinstance(value, _Markdown):
+        return value
+    escaped = SPECIAL.sub(r"\\\g<0>", printable(value))
+    return BLOCK.sub(r"\1\3\\\2\4", escaped)
+
+
+def _span(value: str) -> _Markdown:
+    """Return the text as a code span, which can hold backticks too."""
+    text = printable(value)
+    fence = "`" * (1 + max(map(len, re.findall("`+", text)), default=0))
+    pad = " " if len(fence) > 1 or not text.strip() else ""
+    return _Markdown(f"{fence}{pad}{text}{pad}{fence}")
+
+
+def _cell_span(value: str) -> _Markdown:
+    """Return the text as a code span in a table, where a pipe ends the cell even in code."""
+    return _Markdown(_span(value).replace("|", "\\|"))
+
+
+def _environment(autoescape: bool, finalize: Callable[[Any], Any]) -> Environment:
     environment = Environment(
         loader=FileSystemLoader(TEMPLATES),
         autoescape=autoescape,
+        finalize=finalize,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -73,7 +113,8 @@ def _environment(autoescape: bool) -> Environment:
         "spans": formatting.spans,
         "base64": lambda data: b64encode(data).decode("ascii"),
         "sign": SIGNS.__getitem__,
-        "cell": lambda text: str(text).replace("|", "\\|").replace("\n", " "),
+        "span": _span,
+        "cell_span": _cell_span,
         "code": formatting.short_code,
         "distinct": lambda values: sorted({value for value in values if value is not None}),
         "samples": samples_of,
@@ -89,12 +130,13 @@ def _differences(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key.rpartition('.')[2]} {formatting.setting(value)}" for key, value in values.items())
 
 
-def _whole(run: RunRow) -> str:
-    """Format the run's spec as YAML."""
-    return str(yaml.safe_dump(run.spec, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True))
+def _whole(run: RunRow) -> Markup:
+    """Format the run's spec as YAML, for HTML."""
+    text = str(yaml.safe_dump(run.spec, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True))
+    return Markup("\n").join(map(printable, text.split("\n")))
 
 
-def _relative(drawn: Drawn, folder: Path) -> str:
+def _relative(drawn: Drawn, folder: Path) -> _Markdown:
     """The link from the folder to the figure's picture, or to its first file when Markdown can display none."""
     pictures = [file for file in drawn.files if file.suffix in INLINE] or list(drawn.files)
-    return quote(Path(os.path.relpath(pictures[0], folder)).as_posix())
+    return _Markdown(quote(os.fsencode(Path(os.path.relpath(pictures[0], folder)).as_posix())))

@@ -9,7 +9,7 @@ from sqlalchemy import Connection, select
 from sqlalchemy.exc import DBAPIError
 
 from ssmail.config.spec import spec_hash
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 from ssmail.store import arrays, queries, schema
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
 from ssmail.store.connection import explained, revision_of
@@ -56,9 +56,14 @@ def _problems(path: Path, connection: Connection, revision: str | None, folders:
         yield from (_damage(path, str(line)) for line in damage)
         return
     if revision != REVISIONS[-1]:
-        old = f"its schema is {revision}, but {REVISIONS[-1]} is current"
-        found = "it has no tables yet" if revision is None else old
-        yield Problem("schema", path.name, found, f"run `ssmail db upgrade --db {path}`, then check again")
+        command = command_line("ssmail", "db", "upgrade", "--db", path)
+        if revision is None:
+            found = "it has no tables yet; the process that created it was stopped before it made them"
+            remedy = f"use it as it is, for the next command that opens it makes them, such as `{command}`"
+        else:
+            found = f"its schema is {revision}, but {REVISIONS[-1]} is current"
+            remedy = f"run `{command}`, then check again"
+        yield Problem("schema", path.name, found, remedy)
         return
     yield from _orphans(path, connection)
     runs = queries.runs(connection)
@@ -70,7 +75,8 @@ def _problems(path: Path, connection: Connection, revision: str | None, folders:
 
 
 def _damage(path: Path, reason: str) -> Problem:
-    remedy = f"restore a backup, or save what can be read with `sqlite3 {path} .recover | sqlite3 NEW.db`"
+    command = f"{command_line('sqlite3', path, '.recover')} | sqlite3 NEW.db"
+    remedy = f"restore a backup, or save what can be read with `{command}`"
     return Problem("integrity", path.name, f"the file is damaged: {' '.join(reason.split())}", remedy)
 
 
@@ -80,9 +86,10 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
     tables = [row[0] for row in rows]
     for name in sorted(set(tables)):
         count = tables.count(name)
-        delete = f"DELETE FROM {name} WHERE run_id NOT IN (SELECT id FROM run)"
+        command = command_line("sqlite3", path, f"DELETE FROM {name} WHERE run_id NOT IN (SELECT id FROM run)")
+        remedy = f"run `{command}`" if name in schema.metadata.tables else "give ssmail a database of its own"
         found = f"{count} row{'s belong' if count > 1 else ' belongs'} to no run"
-        yield Problem("orphans", name, f"{found} in the table {name}", f'run `sqlite3 {path} "{delete}"`')
+        yield Problem("orphans", name, f"{found} in the table {name}", remedy)
 
 
 def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
@@ -142,7 +149,7 @@ def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> 
             continue
         for row in queries.artifacts(connection, run.id, checkpoint_root_of(path)):
             if wrong := fault_of(row):
-                remedy = f"copy it from a backup to {row.path}, or {_again(run)}"
+                remedy = f"copy it from a backup to {row.path}, or {_again(run)}" if row.path else _again(run)
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 
@@ -158,7 +165,7 @@ def _stray_folders(path: Path, folders: Sequence[Path], here: set[str]) -> Itera
             found = f"the checkpoints in {folder} belong to no run"
         else:
             continue
-        yield Problem("folders", folder.name, found, f"delete the folder: `rm -r {folder}`")
+        yield Problem("folders", folder.name, found, f"delete the folder: `{command_line('rm', '-r', folder)}`")
 
 
 def _checkpoint_folders(path: Path) -> list[Path]:
@@ -172,10 +179,12 @@ def _run_ids(path: Path) -> set[str]:
     """Return the ids of the runs in the file; empty if it is not an ssmail database."""
     try:
         with opened(path) as engine, engine.connect() as connection:
+            if revision_of(connection, engine) is None:
+                return set()
             return set(connection.execute(select(schema.run.c.id)).scalars())
-    except DBAPIError:
+    except (DBAPIError, InputError):
         return set()
 
 
 def _again(run: RunRow) -> str:
-    return f"delete the run (`ssmail runs delete {run.name}`) and train it again"
+    return f"delete the run (`{command_line('ssmail', 'runs', 'delete', run.name)}`) and train it again"

@@ -17,7 +17,7 @@ from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root_of, fault_of
 from ssmail.store.connection import connect, reading, writing
 from ssmail.store.maintenance.run_rows import Difference, amount, copy_run, first_difference
-from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current
+from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current, revision
 from ssmail.store.queries import RunRow
 
 
@@ -75,10 +75,10 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     source, target = existing(other), file_of(where)
     if target.exists() and source.samefile(target):
         raise InputError(f"{source} is the database itself; give another one to merge into it")
-    for path in (source, target):
-        if path.exists():
-            require_current(path)
-    connect(target).dispose()  # creates the file and its folder
+    require_current(source)
+    if target.exists() and revision(target) is not None:
+        require_current(target)
+    connect(target).dispose()  # creates the file, its folder and its tables, or waits for the process that does so
     copies = CheckpointCopies(checkpoint_root_of(source), checkpoint_root_of(target))
     try:
         merged = _merge(source, target, copies)

@@ -10,9 +10,18 @@ from pathlib import Path
 from sqlalchemy import URL, Engine, func, select
 
 from ssmail.data.atomic_file import atomic_write
-from ssmail.errors import InputError
+from ssmail.errors import InputError, command_line
 from ssmail.store import schema
-from ssmail.store.connection import BUSY_SECONDS, as_url, connect, explained_errors, make_engine, reading, revision_of
+from ssmail.store.connection import (
+    BUSY_SECONDS,
+    as_url,
+    connect,
+    explained_errors,
+    make_engine,
+    name_of,
+    reading,
+    revision_of,
+)
 from ssmail.store.queries import count_rows
 from ssmail.store.schema import REVISIONS
 
@@ -78,7 +87,7 @@ def file_of(where: str | Path) -> Path:
     url = as_url(where)
     if url.get_backend_name() != "sqlite":
         raise InputError(
-            f"{url.render_as_string(hide_password=True)} is a server database, but `ssmail db` is for SQLite files "
+            f"{name_of(url)} is a server database, but `ssmail db` is for SQLite files "
             "only; use the server's own tools (any other command upgrades its tables when it opens it)"
         )
     return Path(str(url.database))
@@ -108,7 +117,8 @@ def require_current(path: Path) -> None:
     found = revision(path)
     if found != REVISIONS[-1]:
         state = "has no tables yet" if found is None else f"has schema {found}, but this ssmail reads {REVISIONS[-1]}"
-        raise InputError(f"{path} {state}; upgrade it first with `ssmail db upgrade --db {path}`")
+        command = command_line("ssmail", "db", "upgrade", "--db", path)
+        raise InputError(f"{path} {state}; upgrade it first with `{command}`")
 
 
 @contextmanager

@@ -3,6 +3,8 @@
 import sqlalchemy as sa
 from alembic import op
 
+from ssmail.store.schema import hexadecimal
+
 revision = "0001"
 down_revision = None
 
@@ -39,6 +41,7 @@ def _create_run() -> None:
         sa.Column("wall_seconds", sa.Float, nullable=False),
         sa.Column("cpu_seconds", sa.Float, nullable=False),
         sa.Column("peak_memory_bytes", sa.BigInteger),
+        *hexadecimal("id"),
     )
     op.create_index("run_cell", "run", ["spec_hash", "seed"])
 
