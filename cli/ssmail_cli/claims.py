@@ -88,10 +88,7 @@ def _as_json(found: "Judgement") -> dict[str, Any]:
     claim, decision = found.claim, found.decision
     return {
         "claim": claim.name,
-        "alias": claim.alias,
-        "sentence": claim.sentence,
-        "section": claim.section,
-        "figure": claim.figure,
+        **{key: value for key, value in asdict(claim).items() if key != "name"},
         "verdict": found.verdict.value,
         "p": decision.p,
         "p_for": decision.p_for,

@@ -113,7 +113,7 @@ def merge(
 
     Copies their checkpoints too; adds all runs or none. Of two runs with the same spec, seed and data, keeps the one
     that got further; of two that ended, keeps the one already there and reports differences. Runs that are being
-    computed are left out.
+    computed, and runs with damaged rows, are left out.
     """
     from ssmail.store.maintenance.merge import merge as merge_databases
 
@@ -123,8 +123,12 @@ def merge(
         differences = [asdict(difference) for difference in done.differences]
         names = {"target": done.target, "other": done.other}
         without = done.without_checkpoints
-        write_json({**names, "runs": runs, "differences": differences, "without_checkpoints": without}, None)
+        damaged = [{"run": problem.subject, "problem": problem.problem} for problem in done.damaged]
+        lists = {"runs": runs, "differences": differences, "without_checkpoints": without, "damaged": damaged}
+        write_json({**names, **lists}, None)
         return
+    for problem in done.damaged:
+        say(f"left out: {problem.problem}")
     for difference in done.differences:
         say(_difference(difference))
     say(f"merged {done.other} into {done.target}: {_fates(done)}")
@@ -160,7 +164,7 @@ def export(
             "give --compact to export what figures and claims need; `ssmail db backup FILE` copies everything."
         )
     require_current(existing(db))
-    store = Store.open(db)
+    store = options.noting_damage(Store.open(db))
     matching = options.select_runs(store, None, method, environment, profile, None, figure)
     runs = settled_cells(matching)
     if not runs:
@@ -169,7 +173,10 @@ def export(
     done = export_compact(db, file, runs, needed.wanted)
     others = len(store.runs()) - len(runs)
     if as_json:
-        write_json({**asdict(done), "left_out_runs": others, "undrawable": needed.undrawable}, None)
+        write_json(
+            {**asdict(done), "damaged": len(done.damaged), "left_out_runs": others, "undrawable": needed.undrawable},
+            None,
+        )
     else:
         _print_export(done, needed, others)
 
@@ -199,6 +206,8 @@ def _fates(done: "Merge") -> str:
         Fate.DIFFERENT: "left out: different from the run already there",
     }
     counts = [f"{counted(done.count(fate), 'run')} {text}" for fate, text in words.items() if done.count(fate)]
+    if done.damaged:
+        counts.append(f"{counted(len(done.damaged), 'run')} left out: damaged")
     return ", ".join(counts) or "no runs in it"
 
 
@@ -221,6 +230,8 @@ def _print_export(done: "Compact", needed: "Contents", others: int) -> None:
         f"{', '.join(sorted(needed.wanted.curves))}); {counted(done.left_out_arrays, 'array')} (kept: {done.arrays}, "
         f"of {done.thinned} of them the part that is drawn)"
     )
+    if done.damaged:
+        note(f"left out: {counted(len(done.damaged), 'damaged row')}; `ssmail db check` names the runs")
     for figure, reason in needed.undrawable.items():
         note(f"{figure} cannot be drawn from it ({reason.removesuffix('.')})")
 

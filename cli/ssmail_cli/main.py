@@ -9,7 +9,7 @@ import typer
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError
 from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
-from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, say
+from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, print_remarks, say
 
 app = typer.Typer(
     name="ssmail",
@@ -64,7 +64,10 @@ def main() -> None:
 def run(arguments: list[str]) -> int:
     """Run one command line and return its exit code; a failure prints one line, and a traceback with SSMAIL_DEBUG=1."""
     try:
-        code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
+        try:
+            code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
+        finally:
+            print_remarks()
         sys.stdout.flush()
     except SsmailError as error:
         if isinstance(error, OutputError):

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError, SsmailError, unknown_name
+from ssmail.errors import InputError, SsmailError, command_line, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
-from ssmail_cli.output import Format
+from ssmail.plots.formatting import counted
+from ssmail_cli.output import Format, note_at_end
 
 if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
@@ -135,10 +136,22 @@ def open_store(database: str) -> "Store":
     if is_missing(database):
         command = "ssmail train --method ssail --profile quick --seeds 0-4"
         raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
-    store = Store.open(database)
+    store = noting_damage(Store.open(database))
     if not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()
+    return store
+
+
+def noting_damage(store: "Store") -> "Store":
+    """Return the store; when the command ends, note how many damaged rows it has left out."""
+
+    def remark() -> str | None:
+        rows = counted(len(store.damaged), "damaged row")
+        command = command_line("ssmail", "db", "check", "--db", store.where)
+        return f"{rows} left out; `{command}` says what is wrong" if store.damaged else None
+
+    note_at_end(remark)
     return store
 
 

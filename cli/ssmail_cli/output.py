@@ -10,7 +10,7 @@ import json
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from enum import StrEnum
@@ -18,13 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ssmail.data.atomic_file import atomic_write
-from ssmail.errors import InputError, SsmailError, masked, printable, sentence
+from ssmail.errors import InputError, SsmailError, masked, printable, sentence, shortened
 
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+LONGEST_CELL = 4000  # characters in a table; a traceback has fewer
 Row = Mapping[str, Any]
+
+
+_remarks: list[Callable[[], str | None]] = []
 
 
 class Format(StrEnum):
@@ -52,6 +56,18 @@ def note(*lines: object) -> None:
     """Print a remark on stderr, beside the result."""
     for line in lines:
         print(_line(line), file=sys.stderr)
+
+
+def note_at_end(remark: Callable[[], str | None]) -> None:
+    """Print what `remark` returns when the command ends: a note on stderr, or nothing."""
+    _remarks.append(remark)
+
+
+def print_remarks() -> None:
+    """Print the notes that are due, each once."""
+    while _remarks:
+        if text := _remarks.pop(0)():
+            note(text)
 
 
 def complain(text: str) -> None:
@@ -122,7 +138,7 @@ def short(value: Any, digits: int = 4) -> str:
         return f"{value:%m-%d %H:%M}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(short(item, digits) for item in value)}]"
-    return str(value)
+    return shortened(str(value), LONGEST_CELL)
 
 
 def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:

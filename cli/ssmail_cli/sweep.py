@@ -10,7 +10,7 @@ import typer
 
 from ssmail.errors import ExitCode, InputError, sentence
 from ssmail.execution import Resume
-from ssmail_cli.options import is_missing
+from ssmail_cli.options import is_missing, noting_damage
 from ssmail_cli.output import chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.run_table import key_metrics, rows_with_metrics
@@ -28,7 +28,7 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, a
     from ssmail.store import Store
 
     check_labels(sweep)  # before there is a database
-    store = Store.open(db)
+    store = noting_damage(Store.open(db))
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
     print_rows(rows, {**_name_columns(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
     return rows
@@ -109,7 +109,7 @@ def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | 
         if resume is Resume.REQUIRE:
             raise InputError(f"there is no database {db}, so nothing to resume; use --resume auto.")
         return dict.fromkeys(sweep, ("new", None))
-    store = Store.open(db)
+    store = noting_damage(Store.open(db))
     actions: dict[Cell, tuple[str, str | None]] = {}
     for cell in sweep:
         found = plan_cell(store, cell, resume)

@@ -8,8 +8,8 @@ from scipy.stats import binom, mannwhitneyu
 from ssmail.evaluation.hypothesis_tests import (
     ALPHA,
     POWER,
+    SEEDS_FOR_EVERY,
     rank_test,
-    seeds_for_every,
     seeds_for_rank_test,
     seeds_for_sign_test,
     sign_test,
@@ -17,7 +17,7 @@ from ssmail.evaluation.hypothesis_tests import (
 
 
 def test_five_of_five_are_the_fewest() -> None:
-    assert seeds_for_every() == 5
+    assert SEEDS_FOR_EVERY == 5
     assert seeds_for_sign_test(1.0) == seeds_for_sign_test(0.0) == 5
 
 

@@ -79,21 +79,21 @@ def prepare(folder: Path, source: Path) -> None:
 
 
 @given(name=st.sampled_from([*FILES]), seed=ONE, changes=st.sampled_from([1, 3, 20]))
-@cases(quick=40, fuzz=700)
+@cases(quick=25, fuzz=700)
 def test_changed_bytes(tmp_path: Path, name: str, seed: int, changes: int) -> None:
     write_folder(tmp_path / "in", FILES | {name: mutated(FILES[name], seed, changes)})
     prepare(tmp_path, tmp_path / "in")
 
 
 @given(data=st.data(), name=st.sampled_from([*FILES]))
-@cases(quick=30, fuzz=500)
+@cases(quick=20, fuzz=500)
 def test_changed_words(tmp_path: Path, data: st.DataObject, name: str) -> None:
     write_folder(tmp_path / "in", FILES | {name: data.draw(damaged(FILES[name]))})
     prepare(tmp_path, tmp_path / "in")
 
 
 @given(method=st.sampled_from([*METHODS, zipfile.ZIP_DEFLATED]), seed=ONE, changes=st.sampled_from([1, 3, 20]))
-@cases(quick=40, fuzz=600)
+@cases(quick=25, fuzz=600)
 def test_changed_archives(tmp_path: Path, method: int, seed: int, changes: int) -> None:
     (tmp_path / "in.zip").write_bytes(mutated(VALID[method], seed, changes))
     prepare(tmp_path, tmp_path / "in.zip")
@@ -106,7 +106,7 @@ NUMBERS = (0, 1, 2, 8, 9, 12, 14, 32, 64, 99, 1000, 2**15, 2**16 - 1, 2**31, 2**
 
 
 @given(data=st.data())
-@cases(quick=30, fuzz=500)
+@cases(quick=20, fuzz=500)
 @pytest.mark.filterwarnings("ignore:Duplicate name")
 def test_changed_lists_of_members(tmp_path: Path, data: st.DataObject) -> None:
     """Other names, links, and numbers that zipfile would believe."""
@@ -251,7 +251,7 @@ def test_folders_in_folders(tmp_path: Path) -> None:
     """Deeper than Python may call itself, and with names longer than a message."""
     write_folder(tmp_path / "in", FILES)
     here = os.open(tmp_path / "in", os.O_RDONLY)
-    for _ in range(1500):
+    for _ in range(1100):
         os.mkdir("b", dir_fd=here)
         below = os.open("b", os.O_RDONLY, dir_fd=here)
         os.close(here)

@@ -118,6 +118,15 @@ def test_a_stored_text_is_only_printed(
         hold(folder, *command, "--db", database)
 
 
+@pytest.mark.parametrize("place", ["method", "host", "error", "metric", "artifact", "artifact path", "spec value"])
+def test_a_hostile_database_is_merged_or_refused_in_print(original: bytes, tmp_path: Path, place: str) -> None:
+    other = tmp_path / "other.db"
+    other.write_bytes(original)
+    spoil(other, place, f"\x1b[2J\u202e\n{place}")
+    hold(tmp_path, "db", "merge", other, "--db", tmp_path / "mine.db")
+    hold(tmp_path, "db", "check", "--db", tmp_path / "mine.db")
+
+
 @pytest.mark.parametrize("form", ["table", "csv", "json"])
 def test_a_figure_of_a_hostile_database_is_explained_as_text(
     original: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str

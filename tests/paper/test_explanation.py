@@ -13,11 +13,12 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.explanation import compare, explain
 from ssmail.paper.reads import contents
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns, provenance, training_curves
 from ssmail.plots.saving import digest, save_figure
 from ssmail.store import RunState, Store
 from ssmail.store.maintenance.compact import export_compact
+from tests.paper.figure_files import save
 
 
 @pytest.fixture

@@ -12,9 +12,10 @@ from ssmail.config.experiments import ablation, ablation_specs
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper import fig3_curricula
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import style
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 
 @pytest.fixture

@@ -14,8 +14,9 @@ from matplotlib.lines import Line2D
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, mean_interval, median_quartiles
 from ssmail.paper import fig4_stability
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 
 def lines(axes: Axes) -> dict[str, Line2D]:

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
 from ssmail.paper import fig5_modes
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import style
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 from .handmade_arrays import AGENTS, STARTS, arrays, lanes
 

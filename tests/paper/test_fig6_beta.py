@@ -12,8 +12,9 @@ from ssmail.config.experiments import ablation_specs
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper import fig6_beta
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 RESULTS = {0.0: [0.4, 0.2, None], 0.05: [0.01, 0.02, 0.03], 1.0: [0.1, 0.1, 0.4]}
 

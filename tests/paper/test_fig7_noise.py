@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, mean_interval, median_quartiles
 from ssmail.paper import fig7_noise
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 STEPS = 6
 LATE = range(STEPS // 2 + 1, STEPS + 1)  # 4, 5, 6

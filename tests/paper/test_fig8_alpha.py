@@ -14,9 +14,10 @@ from ssmail.config.spec import ENVIRONMENTS
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, median_quartiles
 from ssmail.paper import fig8_alpha
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 POSITIVE, BOTH = (0.0, 1.0), (-1.0, 1.0)
 RESULTS = {POSITIVE: [0.01, 0.02, 0.03], BOTH: [0.001, 0.002, 0.003]}

@@ -9,9 +9,10 @@ import pytest
 
 from ssmail.errors import InputError
 from ssmail.paper import fig9_yjunction
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import NoRuns
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 from .handmade_arrays import AGENTS, STEPS, lanes
 

@@ -15,9 +15,10 @@ from PIL import Image
 
 import ssmail
 from ssmail.errors import InputError
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance, saving
 from ssmail.store import RunState, Store
+from tests.paper.figure_files import save
 
 NAMES = ("fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "fig9")
 FORMATS = {name: provenance.FORMATS if name == "fig4" else ("svg",) for name in NAMES}  # all of each would take minutes
@@ -99,12 +100,13 @@ DRAW = """
 import json
 import sys
 from pathlib import Path
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
+from ssmail.plots.saving import save_figure
 from ssmail.store import Store
 store = Store.open(sys.argv[1])
 for name, formats in json.loads(sys.argv[3]).items():
     record = FIGURES[name].collect(store)
-    save(name, record, FIGURES[name].draw(record), Path(sys.argv[2]), formats)
+    save_figure(FIGURES[name].stem, record, FIGURES[name].draw(record), Path(sys.argv[2]), formats)
 assert "matplotlib.pyplot" not in sys.modules, "a figure must not touch pyplot's global state"
 """
 

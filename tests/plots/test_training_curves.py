@@ -157,9 +157,12 @@ def test_many_groups_have_legible_legends_beside_the_curves(store: Store, add_ru
 
 
 @pytest.mark.parametrize(
-    "method", ["$x$", "$\\nosuch{$", "a $ b $ c", "_hidden", "two\nlines\x1b[2J\u202e", "<b>&]]>-->", "x" * 5000]
+    "method",
+    ["$x$", "$\\nosuch{$", "a $ b $ c", "_hid", "two\nlines\x1b[2J\u202e", "<b>&]]>-->", "x" * 5000, "日本"],
 )
-def test_a_stored_method_is_drawn_as_it_is(method: str, store: Store, add_run: Any, tmp_path: Path) -> None:
+def test_a_stored_method_is_drawn_as_it_is(
+    method: str, store: Store, add_run: Any, tmp_path: Path, recwarn: pytest.WarningsRecorder
+) -> None:
     """Neither as mathematics, which may not parse, nor left out of the legend; the files stay readable."""
     add_run(0)
     with closing(sqlite3.connect(store.where)) as connection, connection:
@@ -169,6 +172,7 @@ def test_a_stored_method_is_drawn_as_it_is(method: str, store: Store, add_run: A
     (text, *_) = (item.get_text() for item in figure.legends[0].get_texts())
     assert text.lstrip().replace(r"\$", "$").startswith(printable(method)[:40])
     svg, csv = save_figure(record.stem, record, figure, tmp_path, ["svg"])
+    assert not recwarn.list
     ElementTree.parse(svg)
     assert all(character.isprintable() or character == "\n" for character in csv.read_text())
     assert printable(method).replace('"', '""') in csv.read_text()

@@ -24,9 +24,13 @@ from ssmail.store.schema import REVISIONS, metadata
 ASSETS = Path(__file__).parent / "assets"
 
 
-def test_a_new_database_has_the_tables_of_the_schema(store: Store) -> None:
+@pytest.mark.parametrize("asset", [None, *sorted(ASSETS.glob("schema_*.sqlite"))], ids=lambda path: path and path.stem)
+def test_new_and_upgraded_databases_have_the_tables_of_the_schema(asset: Path | None, tmp_path: Path) -> None:
     """The migrations, applied one after the other, end in exactly the tables that the code uses."""
-    engine = create_engine(f"sqlite:///{store.where}")
+    if asset is not None:
+        shutil.copy(asset, tmp_path / "ssmail.db")
+    Store.open(tmp_path / "ssmail.db").close()
+    engine = create_engine(f"sqlite:///{tmp_path / 'ssmail.db'}")
     with engine.connect() as open_connection:
         assert compare_metadata(MigrationContext.configure(open_connection), metadata) == []
         open_connection.exec_driver_sql("DROP INDEX run_cell")  # negative control

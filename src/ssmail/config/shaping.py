@@ -60,11 +60,9 @@ def _is_list(value: Any) -> bool:
 
 def _is_row(value: Any, length: int) -> bool:
     """Return whether the value is a list of this many finite numbers."""
-    return _is_list(value) and len(value) == length and all(map(_is_number, value))
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    if not _is_list(value) or len(value) != length:
+        return False
+    return all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in value)
 
 
 AlphaPiece = tuple[float, float, float]

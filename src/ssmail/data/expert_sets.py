@@ -12,7 +12,7 @@ import math
 import os
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,7 @@ OTHER_ARRAYS = {
 }  # of a file, beside those of the splits, `parameters` and `hash`
 
 LARGEST_FILE, MOST_ARRAYS = 2**31, 64  # bytes; members
+LARGEST_NUMBER = 2**40  # of a trial or a frame
 LONGEST_TEXT, LONGEST_HEADER = 2**22, 2**10  # bytes of a text, and of what .npy declares about an array
 MAGIC = b"\x93NUMPY\x01\x00"  # of the only version that such arrays need; the header's length follows in two bytes
 HEADER = re.compile(
@@ -53,12 +54,24 @@ DIGEST = re.compile("[0-9a-f]{64}")
 def generate(data: DataSpec) -> ExpertSet:
     """Generate the expert set of the environment in spec.GENERATED_ENVIRONMENTS whose parameters `data` has.
 
-    Raises InputError for parameters that no set can have.
+    Raises InputError for parameters that no set can have, or only one that is too large for a file.
     """
     if data.letters is not None:
+        _check_size("letters", data.letters, len(data.letters.word), arrays=2)
         return letters.generate(data.letters)
     assert data.yjunction is not None
+    _check_size("yjunction", data.yjunction, data.yjunction.agents, arrays=2 + len(yjunction.LANES))
     return yjunction.generate(data.yjunction)
+
+
+def _check_size(environment: str, params: LettersSpec | YJunctionSpec, agents: int, arrays: int) -> None:
+    """Raise InputError if the `arrays` (B, T, N, 2) of all splits would be too large for a file."""
+    size = 8 * 2 * arrays * params.steps * agents * sum(getattr(params, split) for split in SPLITS)
+    if size > LARGEST_FILE:
+        raise InputError(
+            f"the expert set would have more than {LARGEST_FILE >> 30} GB; lower data.{environment}.train, validation, "
+            "test or steps"
+        )
 
 
 def check_target(path: Path, *, force: bool) -> None:
@@ -187,14 +200,17 @@ class _File:
         if size > LARGEST_FILE or len(members) > MOST_ARRAYS:
             raise self.fault(f"{path} is larger than any expert set of ssmail")
         for member in members:
+            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
+                raise self.fault(
+                    f"{member.filename!r:.40} in {path} is compressed or encrypted, which ssmail never does"
+                )
+        if sum(member.file_size for member in members) > size:  # as members that lie on one another do
+            raise self.fault(f"{path} declares more than it holds")
+        for member in members:
             key = member.filename.removesuffix(".npy")
             if key in self.headers:
                 raise self.fault(f"{path} holds the array {key!r:.40} twice")
-            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
-                raise self.fault(f"{key!r:.40} in {path} is compressed or encrypted, which ssmail never does")
             self.headers[key] = self._header(key, member)
-        if sum(member.file_size for member in members) > size:  # members that lie on one another
-            raise self.fault(f"{path} declares more than it holds")
 
     def _header(self, key: str, member: zipfile.ZipInfo) -> _Header:
         """Read the header of a .npy member, which numpy would evaluate as Python."""
@@ -247,17 +263,17 @@ class _File:
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
         return array
 
-    def whole_numbers(self, key: str, count: int, allowed: Iterable[int] | None) -> Any:
-        """Return an array (count,) of those numbers that are `allowed`; of any from 0 on if that is None."""
+    def whole_numbers(self, key: str, count: int, below: int) -> Any:
+        """Return an array (count,) of numbers from 0 on, all less than `below`."""
         array = self.array(key, (count,), np.int64)
-        if not (array >= 0 if allowed is None else np.isin(array, list(allowed))).all():
+        if array.min() < 0 or array.max() >= below:
             raise self.fault(f"{key} in {self.path} holds a number that it cannot hold")
         return array
 
     def motion(self, split: str, shape: tuple[int, ...], modes: int = 1) -> tuple[Any, Any, Any]:
         """Return positions and velocities of this shape (B, T, N, P), and the modes (B,), of a split."""
         positions, velocities = (self.array(f"{split}/{name}", shape, np.float64) for name in FIELDS["letters"][:2])
-        return positions, velocities, self.whole_numbers(f"{split}/mode", shape[0], range(modes))
+        return positions, velocities, self.whole_numbers(f"{split}/mode", shape[0], modes)
 
     def text(self, key: str) -> str:
         """Return an array that is a single text."""
@@ -305,9 +321,8 @@ def _read_mocap(file: _File, _: dict[str, Any]) -> ExpertSet:
     for split in SPLITS:
         windows = max(1, file.header(f"{split}/trial").count)
         positions, velocities, _ = file.motion(split, (windows, params.window_of(split), len(joints), 3))
-        trials = file.whole_numbers(f"{split}/trial", windows, getattr(params, split))
-        frames = file.whole_numbers(f"{split}/frame", windows, None)
-        splits[split] = Trajectories.single_mode(positions, velocities, trials, frames)
+        cut = (file.whole_numbers(f"{split}/{name}", windows, LARGEST_NUMBER) for name in ("trial", "frame"))
+        splits[split] = Trajectories.single_mode(positions, velocities, *cut)
     sources = file.json("sources")
     if not all(isinstance(digest, str) and DIGEST.fullmatch(digest) for digest in sources.values()):
         raise file.fault(f"the sources inside {file.path} are not the digests of files")

@@ -93,16 +93,13 @@ def _still(params: LettersSpec, count: int) -> Jitter:
     }
 
 
-def _jitter(params: LettersSpec, count: int, rng: np.random.Generator) -> Jitter:
-    zeros = _still(params, count)
-    drawn = {name: rng.uniform(-1, 1, zeros[name].shape) * (SPREADS[name] * params.jitter) for name in SPREADS}
-    return drawn | {"phase": rng.uniform(0, 2 * np.pi, zeros["phase"].shape)}
-
-
 def _generate_split(params: LettersSpec, count: int, rng: np.random.Generator) -> Trajectories:
     """Generate `count` trajectories; every pen in every trajectory has its own jitter."""
     times = np.tile(np.arange(-1.0, params.steps), (count, 1))  # one step before the first state, for its velocity
-    positions = _positions(params, times, _jitter(params, count, rng))
+    zeros = _still(params, count)
+    jitter = {name: rng.uniform(-1, 1, zeros[name].shape) * (SPREADS[name] * params.jitter) for name in SPREADS}
+    jitter["phase"] = rng.uniform(0, 2 * np.pi, zeros["phase"].shape)
+    positions = _positions(params, times, jitter)
     return Trajectories.single_mode(positions[:, 1:], np.diff(positions, axis=1))
 
 

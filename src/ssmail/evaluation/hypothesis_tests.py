@@ -1,8 +1,8 @@
 """Hypothesis tests and confidence intervals for a few runs, and the number of seeds that a test needs.
 
-All tests depend on the order of the values alone (a permutation test may also use the values themselves), so a diverged
-run has a place in them: its error is +inf, it shares the last rank with the other diverged runs, and it loses against
-every finite run. All tests are exact, except the rank test of large groups.
+All tests depend on the order of the values alone, so a diverged run has a place in them: its error is +inf, it shares
+the last rank with the other diverged runs, and it loses against every finite run. All tests are exact, except the rank
+test of large groups.
 
 `sign_test` and `rank_test` are one-sided. The intervals of `median` and `shift` invert them: each end is the bound that
 a one-sided test at level ALPHA does not reject, so an interval has confidence 1 - 2 * ALPHA. Where n values are too few
@@ -24,13 +24,12 @@ from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import as_table
 
 Alternative = Literal["two-sided", "less", "greater"]
-Scale = Literal["values", "ranks"]
 
 ALPHA = 0.05
+SEEDS_FOR_EVERY = math.ceil(-math.log2(ALPHA))  # so many of so many show that most seeds succeed: 2 ** -n <= ALPHA
 POWER = 0.8  # the probability with which a planned test at ALPHA decides
 MAX_SPLITS = 200_000  # that a permutation test enumerates: 10 against 10 runs
 MAX_SEEDS = 1000  # beyond which a planned test counts as out of reach
-_ROUNDING = 1e-12  # relative to the largest value; closer differences count as ties
 
 
 class Estimate(NamedTuple):
@@ -54,10 +53,8 @@ class OneSided(NamedTuple):
 class PermutationTest(NamedTuple):
     """The result of an exact permutation test."""
 
-    difference: float  # observed: mean of the first group minus that of the second (mean ranks, for a test on ranks)
     p: float  # share of all splits at least as extreme as the observed one, which is among them: never 0
     least: float  # the smallest p that any split of these values has
-    splits: int  # how many splits there are
 
 
 # -- one sample --------------------------------------------------------------------------------------------------------
@@ -100,36 +97,27 @@ def deviations(values: npt.ArrayLike) -> Floats:
 
 
 def permutation_test(
-    first: npt.ArrayLike, second: npt.ArrayLike, alternative: Alternative = "two-sided", on: Scale = "values"
+    first: npt.ArrayLike, second: npt.ArrayLike, alternative: Alternative = "two-sided"
 ) -> PermutationTest:
-    """Exact test of the difference between the means of two independent groups.
+    """Exact test of the difference between two independent groups on midranks (Wilcoxon, Mann and Whitney).
 
-    All C(R1 + R2, R1) splits of the pooled values are enumerated. p is the share of splits whose difference d is >= the
-    observed one ("greater"), <= it ("less"), or has |d| >= its size ("two-sided"), ties included. With `on` "ranks" the
-    pooled values are replaced by their midranks (Wilcoxon, Mann and Whitney), so they may be +-inf. Raises ValueError
-    for an empty group, NaN, infinite values with `on` "values", and more than MAX_SPLITS splits.
+    All C(R1 + R2, R1) splits of the pooled values, which may be +-inf, are enumerated. With d the rank sum of the first
+    group less its expectation, p is the share of splits with a d >= the observed one ("greater"), <= it ("less"), or as
+    large in size ("two-sided"), ties included. Raises ValueError for an empty group, NaN, and more than MAX_SPLITS
+    splits.
     """
     a, b = as_table(first), as_table(second)
     pooled = np.concatenate([a, b])
     splits = math.comb(len(pooled), len(a))
     if pooled.ndim != 1 or np.isnan(pooled).any():
         raise ValueError("a permutation test needs one known number per run")
-    if on == "values" and not np.isfinite(pooled).all():
-        raise ValueError("a mean needs finite values; test on ranks, where a diverged run is the worst")
     if splits > MAX_SPLITS:
         raise ValueError(f"{splits} splits are too many to enumerate; {MAX_SPLITS} are the most")
-    if on == "ranks":
-        pooled = midranks(pooled)
-    # The difference of the means for every split, the observed split first.
-    centred = pooled - pooled.mean()
     chosen = np.fromiter(chain.from_iterable(combinations(range(len(pooled)), len(a))), dtype=np.intp)
-    sums = centred[chosen.reshape(splits, len(a))].sum(axis=1)  # (splits,)
-    differences = sums / len(a) - (centred.sum() - sums) / len(b)
-    # p of the observed split, and of the most extreme one.
-    extremity = {"two-sided": np.abs(differences), "greater": differences, "less": -differences}[alternative]
-    tolerance = _ROUNDING * np.abs(pooled).max()
-    p, least = (float(np.mean(extremity >= bound - tolerance)) for bound in (extremity[0], extremity.max()))
-    return PermutationTest(float(differences[0]), p, least, splits)
+    sums = midranks(pooled)[chosen.reshape(splits, len(a))].sum(axis=1)  # the observed split first; exact halves
+    excess = sums - len(a) * (len(pooled) + 1) / 2
+    extremity = {"two-sided": np.abs(excess), "greater": excess, "less": -excess}[alternative]
+    return PermutationTest(*(float(np.mean(extremity >= bound)) for bound in (extremity[0], extremity.max())))
 
 
 def midranks(values: npt.ArrayLike) -> Floats:
@@ -147,7 +135,7 @@ def rank_test(first: npt.ArrayLike, second: npt.ArrayLike) -> OneSided:
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     if math.comb(len(a) + len(b), len(a)) <= MAX_SPLITS:
-        return OneSided(*(permutation_test(a, b, side, on="ranks").p for side in ("less", "greater")))
+        return OneSided(*(permutation_test(a, b, side).p for side in ("less", "greater")))
     from scipy.stats import mannwhitneyu
 
     ranks = midranks(np.concatenate([a, b]))
@@ -224,11 +212,6 @@ def seeds_for_rank_test(superiority: float) -> int | None:
     gap = abs(superiority - 0.5)
     needed = (ndtri(1 - ALPHA) + ndtri(POWER)) ** 2 / (6 * gap**2) if gap else math.inf
     return math.ceil(needed) if needed <= MAX_SEEDS else None
-
-
-def seeds_for_every() -> int:
-    """Smallest n at which n successes of n show that more than half of all seeds succeed: 2 ** -n <= ALPHA."""
-    return math.ceil(-math.log2(ALPHA))
 
 
 def _at_least(count: int, of: int) -> float:

@@ -29,7 +29,7 @@ from ssmail.paper.samples import LEAST, WORST, Runs, beginning_mean, end_mean
 from ssmail.plots import curves, style
 from ssmail.plots.curves import Band, Curve, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Group, Reads, Selection
+from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig3"
@@ -75,16 +75,15 @@ def collect(store: Store, selection: Selection, statistic: Statistic) -> Curricu
     expected = store.metrics([run.id for run in selection.runs], names=[EXPECTED])
     return CurriculaRecord(
         bands=curves.bands(store, selection, [MEASURED], statistic),
-        expected=tuple(_longest(group, expected, statistic) for group in selection.groups),
+        expected=tuple(
+            # of the run with the most epochs, for it is the same for every seed
+            max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
+            for group in selection.groups
+        ),
         statistic=statistic,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=selection.notes,
     )
-
-
-def _longest(group: Group, expected: pd.DataFrame, statistic: Statistic) -> Curve:
-    """The closed form of the run with the most epochs; it is the same for every seed."""
-    return max(band(group, EXPECTED, expected, statistic).curves, key=lambda curve: len(curve.epochs))
 
 
 def growth(lengths: Floats) -> float:
@@ -126,9 +125,7 @@ def draw(record: CurriculaRecord) -> Figure:
         handles = []
         for shown, marker in zip(record.bands, cycle("so^Dv"), strict=False):
             look = {"ls": "-", "marker": marker, "markevery": 0.15, "mew": 0, "alpha": 0.75}
-            line = curves.draw_band(axes, shown, strokes[shown.label], **look)
-            line.set_label(curves.count_label(shown))
-            handles.append(line)
+            handles.append(curves.draw_band(axes, shown, strokes[shown.label], **look))
         for shown, curve in zip(record.bands, record.expected, strict=True):
             (line,) = axes.plot(curve.epochs, curve.values, color=style.REFERENCE, lw=0.8, ls=DASHES, zorder=4)
             line.set_gid(printable(f"closed-form-{shown.label}"))

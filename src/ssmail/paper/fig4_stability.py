@@ -136,6 +136,7 @@ def draw(record: StabilityRecord) -> Figure:
                 if other is not shown:
                     curves.draw_centre(axes, other, strokes[other.label], lw=0.7, alpha=0.8)
             handles.append(curves.draw_band(axes, shown, strokes[shown.label]))
+            handles[-1].set_label(style.literal(shown.label))
             axes.set_title(curves.count_label(shown), loc="left", fontsize=7, weight="bold", pad=5)
             if record.constant_velocity is not None:
                 reference = style.draw_reference(axes, record.constant_velocity)

@@ -210,7 +210,9 @@ def draw(record: ModesRecord) -> Figure:
     cells = _cells(record.panels, labels)
     rows, columns = (max(place[i] for place in cells) + 1 for i in (0, 1))
     with style.sheet():
-        figure = style.new_figure(height=0.6 + rows * _panel_height(record.frame))
+        left, right, bottom, top = record.frame
+        panel_height = float(np.clip(1.35 * (top - bottom) / (right - left), 0.6, 2.0)) + 0.15  # inches, with the gap
+        figure = style.new_figure(height=0.6 + rows * panel_height)
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         strokes = style.strokes(labels)
         for (row, column), axes in np.ndenumerate(grid):
@@ -240,11 +242,6 @@ def _cells(panels: Sequence[Panel], labels: Sequence[str]) -> dict[tuple[int, in
         return {(i // 2, i % 2): panel for i, panel in enumerate(panels)}
     columns = [[panel for panel in panels if panel.label == label] for label in labels]
     return {(i, j): panel for j, column in enumerate(columns) for i, panel in enumerate(column)}
-
-
-def _panel_height(frame: Frame) -> float:
-    """The height in inches, gap included, of a panel of half a column's width at equal scales."""
-    return float(np.clip(1.35 * (frame[3] - frame[2]) / (frame[1] - frame[0]), 0.6, 2.0)) + 0.15
 
 
 def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colour: str) -> None:

@@ -175,7 +175,11 @@ def draw(record: BetaRecord) -> Figure:
         for axes in (upper, lower):
             axes.grid(False, axis="x")
         handles = _draw_errors(upper, record)
-        _draw_balances(lower, record)
+        for index, column in enumerate(record.columns):
+            x = _places(index, len(column.balance))
+            (points,) = lower.plot(x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8)
+            points.set_gid(printable(f"balances-{column.label}"))
+        _draw_centres(lower, Summary(*np.array([column.balance_summary for column in record.columns]).T))
         if record.constant_velocity is not None:
             handles.append(style.draw_reference(upper, record.constant_velocity))
         figure.legend(handles=handles, loc="outside upper center", ncols=2)
@@ -208,15 +212,6 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
         label = f"diverged, {diverged} of {count} runs"
         handles.append(Line2D([], [], color=CROSSES, marker="x", ls="", ms=5, mew=1, label=label))
     return handles
-
-
-def _draw_balances(axes: Axes, record: BetaRecord) -> None:
-    for index, column in enumerate(record.columns):
-        x = _places(index, len(column.balance))
-        axes.plot(
-            x, column.balance, ".", color=POINTS, ms=5, mew=0, alpha=0.8, gid=printable(f"balances-{column.label}")
-        )
-    _draw_centres(axes, Summary(*np.array([column.balance_summary for column in record.columns]).T))
 
 
 def _draw_centres(axes: Axes, summary: Summary) -> Line2D:

@@ -42,7 +42,7 @@ from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
 from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
-from ssmail.plots.curves import REFERENCE, Band, Curve, band
+from ssmail.plots.curves import REFERENCE, Band, band
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.store import RunRow, RunState, Store
@@ -114,7 +114,8 @@ class Panel:
     @property
     def _peaks(self) -> list[list[float]]:
         """The highest finite error of each run, by method; without methods that have none."""
-        found = [[float(v.max()) for curve in shown.curves if len(v := _finite(curve))] for shown in self.bands]
+        finite = [[curve.values[np.isfinite(curve.values)] for curve in shown.curves] for shown in self.bands]
+        found = [[float(values.max()) for values in curves if len(values)] for curves in finite]
         return [peaks for peaks in found if peaks]
 
     def rows(self, statistic: Statistic) -> Iterator[tuple[object, ...]]:
@@ -190,27 +191,15 @@ def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
 def _panel(store: Store, selection: Selection, condition: str, statistic: Statistic) -> Panel:
     end = CONDITIONS[condition]
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
-    errors = _over_steps({run.id: store.array(run.id, f"test{end}/mse") for run in finished})
+    stored = {run.id: store.array(run.id, f"test{end}/mse") for run in finished}
+    rows = [(run_id, step, error) for run_id, errors in stored.items() for step, error in enumerate(errors, start=1)]
+    errors = pd.DataFrame(rows, columns=["run_id", "step", "value"])  # like Store.metrics
     bands = tuple(band(group, METRIC, errors, statistic) for group in selection.groups)
+    slopes = [np.array([late_slope(curve.values) for curve in shown.curves]) for shown in bands]
     references = [store.array(run.id, f"{REFERENCE}{end}/mse") for run in finished]  # those on one data set agree
     reference = np.median(references, axis=0) if references else np.empty(0)
-    return Panel(condition, bands, tuple(map(_slopes, bands)), reference, late_slope(reference))
-
-
-def _over_steps(errors: dict[str, Floats]) -> pd.DataFrame:
-    """Arrange errors (T,) by run id like Store.metrics, with the predicted step, counted from 1, as the step."""
-    rows = [(run, step, value) for run, values in errors.items() for step, value in enumerate(values, start=1)]
-    return pd.DataFrame(rows, columns=["run_id", "step", "value"])
-
-
-def _finite(curve: Curve) -> Floats:
-    finite: Floats = curve.values[np.isfinite(curve.values)]
-    return finite
-
-
-def _slopes(shown: Band) -> Slopes:
-    runs = np.array([late_slope(curve.values) for curve in shown.curves])
-    return Slopes(runs, mean_interval(runs))
+    means = tuple(Slopes(runs, mean_interval(runs)) for runs in slopes)
+    return Panel(condition, bands, means, reference, late_slope(reference))
 
 
 def slope(errors: Floats) -> float:
@@ -301,7 +290,6 @@ def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> l
     handles = []
     for shown in panel.bands:
         handles.append(curves.draw_band(axes, shown, strokes[shown.label]))
-        handles[-1].set_label(curves.count_label(shown))
     if len(panel.reference):
         steps = np.arange(1, len(panel.reference) + 1)
         (line,) = axes.plot(steps, panel.reference, color=style.REFERENCE, lw=0.8, ls=":", gid="constant-velocity")

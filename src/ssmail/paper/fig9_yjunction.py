@@ -83,7 +83,9 @@ def _fork(centre_lines: Floats) -> tuple[float, float]:
 def draw(record: YJunctionRecord) -> Figure:
     """Draw the environment from above, both axes on one scale, with the legend of the agents above."""
     with style.sheet():
-        figure = style.new_figure(height=_height(record))
+        width, height = np.ptp(record.centre_lines, axis=(0, 1))
+        tall = float(np.clip(2.5 * height / width, 0.8, 3.5))
+        figure = style.new_figure(height=tall + 0.85)  # with labels and legend
         axes = figure.add_subplot()
         axes.set_aspect("equal")
         axes.grid(False)
@@ -95,12 +97,6 @@ def draw(record: YJunctionRecord) -> Figure:
         _draw_times(axes, record)
         figure.legend(loc="outside upper center", ncols=record.trajectories.shape[2], handletextpad=0.2)
         return figure
-
-
-def _height(record: YJunctionRecord) -> float:
-    """The height in inches, labels and legend included, for equal scales at one column's width."""
-    extent = np.ptp(record.centre_lines, axis=(0, 1))
-    return float(np.clip(2.5 * extent[1] / extent[0], 0.8, 3.5)) + 0.85
 
 
 def _draw_road(axes: Axes, record: YJunctionRecord) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 
 from ssmail.evaluation import hypothesis_tests
 from ssmail.evaluation.hypothesis_tests import (
+    SEEDS_FOR_EVERY,
     UNKNOWN,
     Estimate,
-    seeds_for_every,
     seeds_for_rank_test,
     seeds_for_sign_test,
 )
@@ -42,7 +42,7 @@ def every_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: 
     def tested() -> _Tested:
         inside = _inside(sample, side, bar)
         p = (0.5**inside, 1.0) if inside == len(sample.values) else (1.0, 0.0)
-        return _Tested(*_median(sample, side, bar), *p, seeds_for_every())
+        return _Tested(*_median(sample, side, bar), *p, SEEDS_FOR_EVERY)
 
     test = f"every seed {side} {bar:g}: exact binomial test against half of them; one seed that is not contradicts"
     return _part(statement, statistic, test, (sample,), tested)

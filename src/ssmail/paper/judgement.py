@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmail.errors import InputError, command_line, unknown_name
+from ssmail.errors import command_line, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.paper.samples import Runs
@@ -47,33 +47,22 @@ def judge(store: Store, profile: str | None = None, only: Sequence[str] | None =
         if name not in names:
             raise unknown_name("claim", name, names)
     wanted = {names[name] for name in only} if only else set(names.values())
-    found = [_runs(store, figure.name, profile) for figure in figures]
-    decisions = [Decision(figure.decide(runs)) for figure, (runs, _) in zip(figures, found, strict=True)]
+    found = [Runs.of_figure(store, figure.name, profile) for figure in figures]
+    decisions = [Decision(figure.decide(runs)) for figure, runs in zip(figures, found, strict=True)]
     adjusted = holm([decision.p for decision in decisions])
     return [
-        _judgement(figure.claim, runs, notes, decision, p, profile)
-        for figure, (runs, notes), decision, p in zip(figures, found, decisions, adjusted, strict=True)
+        _judgement(figure.claim, runs, decision, p, profile)
+        for figure, runs, decision, p in zip(figures, found, decisions, adjusted, strict=True)
         if figure.claim.name in wanted
     ]
 
 
-def _runs(store: Store, figure: str, profile: str | None) -> tuple[Runs, tuple[str, ...]]:
-    """The figure's runs, with notes. Runs that cannot be compared are left out; the note then states why."""
-    try:
-        runs = Runs.of_figure(store, figure, profile)
-    except InputError as error:
-        return Runs(store), (str(error),)
-    return runs, runs.selection.notes
-
-
-def _judgement(
-    claim: Claim, runs: Runs, notes: tuple[str, ...], decision: Decision, p_holm: float, profile: str | None
-) -> Judgement:
+def _judgement(claim: Claim, runs: Runs, decision: Decision, p_holm: float, profile: str | None) -> Judgement:
     used = dict.fromkeys(run for part in decision.parts for sample in part.samples for run in sample.runs)
     chosen = runs.selection.runs
     drawn = chosen[0].profile if chosen else None
     command = _command(claim, decision, drawn or profile or "quick")
-    return Judgement(claim, decision, p_holm, drawn, tuple(used), notes, command)
+    return Judgement(claim, decision, p_holm, drawn, tuple(used), runs.selection.notes, command)
 
 
 def _command(claim: Claim, decision: Decision, profile: str) -> str:

@@ -9,7 +9,6 @@ pandas: a figure's module is imported when it is used.
 import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from ssmail.plots import FigureRecord
@@ -108,15 +107,3 @@ FIGURES: dict[str, FigureModule] = {key: module for module in _MODULES for key i
 
 CLAIMS = ("fig4", "fig5", "fig6", "fig7", "fig8", "fig3", "fig1", "fig2")
 """The figures whose modules decide the claims C1 to C8, in this order."""
-
-
-def save(
-    name: str, record: FigureRecord, figure: "Figure", outdir: Path, formats: Sequence[str] = ("png",)
-) -> list[Path]:
-    """Write the figure in each of `formats` (png, pdf, svg) and a CSV of its contents; return the paths, CSV last.
-
-    `name` is a key of FIGURES. Raises InputError for an unknown format or a folder that cannot be written.
-    """
-    from ssmail.plots.saving import save_figure
-
-    return save_figure(FIGURES[name].stem, record, figure, outdir, formats)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import InputError
 from ssmail.paper.claims import Sample
 from ssmail.plots import NoRuns
 from ssmail.plots.metric_units import is_error
@@ -24,7 +25,6 @@ from ssmail.store.comparison import latest_values
 Array = npt.NDArray[Any]
 
 WORST, LEAST = np.inf, -np.inf  # what a diverged run counts as
-NO_SELECTION = Selection((), ())
 PARTS = 5  # the first and the last fifth of the epochs are the beginning and the end of training
 
 
@@ -37,18 +37,17 @@ class Runs:
     """
 
     store: Store
-    selection: Selection = NO_SELECTION
+    selection: Selection
 
     @classmethod
     def of_figure(cls, store: Store, figure: str, profile: str | None) -> "Runs":
-        """The runs that the figure chooses by default; without any, no groups.
-
-        Raises InputError for an unknown figure and for runs on different data.
-        """
+        """The runs that the figure chooses by default. Runs that cannot be compared are left out; a note says why."""
         try:
             return cls(store, select(store, figure, profile=profile))
         except NoRuns:
-            return cls(store)
+            return cls(store, Selection((), ()))
+        except InputError as error:
+            return cls(store, Selection((), (str(error),)))
 
     def metric(self, group: Any, name: str, *, diverged: float, label: str | None = None) -> Sample:
         """Sample the last value of a metric. An error that is not finite counts as diverged."""

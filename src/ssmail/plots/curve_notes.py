@@ -7,7 +7,7 @@ import numpy as np
 
 from ssmail.evaluation.hypothesis_tests import MAX_SPLITS, permutation_test
 from ssmail.plots import style
-from ssmail.plots.curves import CEILING, Band, Curve
+from ssmail.plots.curves import CEILING, Band
 
 
 def of_errors(bands: Sequence[Band]) -> tuple[str, ...]:
@@ -26,14 +26,13 @@ def cut(bands: Sequence[Band]) -> tuple[str, ...]:
 
 def high(bands: Sequence[Band], end: float = CEILING) -> tuple[str, ...]:
     """Count the runs of each group that rise above the end of the scale."""
-    counts = {shown.label: sum(_rises(curve, end) for curve in shown.curves) for shown in bands}
+    counts = {
+        shown.label: sum(bool((np.isfinite(run.values) & (run.values > end)).any()) for run in shown.curves)
+        for shown in bands
+    }
     return tuple(
         f"{label}: {n} of the runs rise above {end:.3g}, where the scale ends." for label, n in counts.items() if n
     )
-
-
-def _rises(curve: Curve, end: float) -> bool:
-    return bool((np.isfinite(curve.values) & (curve.values > end)).any())
 
 
 def comparisons(bands: Sequence[Band]) -> tuple[str, ...]:
@@ -44,7 +43,7 @@ def comparisons(bands: Sequence[Band]) -> tuple[str, ...]:
         unfinished, many = np.isnan([*a, *b]).any(), math.comb(len(a) + len(b), len(a)) > MAX_SPLITS
         if unfinished or many:
             continue  # some run has no value at the last epoch, or there are too many splits to enumerate
-        found = permutation_test(a, b, on="ranks")
+        found = permutation_test(a, b)
         notes.append(
             f"{bands[0].label} against {other.label} at the last epoch: medians {np.median(a):.3g} and "
             f"{np.median(b):.3g}, exact two-sided permutation test on ranks p = {found.p:.2g} (least "

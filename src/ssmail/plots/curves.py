@@ -170,7 +170,7 @@ def _over(epochs: Integers, curve: Curve, error: bool) -> Floats:
 def draw_band(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> Line2D:
     """Draw the runs, the spread, the centre and a cross for each diverged run, within the limits that are set.
 
-    `line` changes how the centre looks. Returns its line, which has the band's label.
+    `line` changes how the centre looks. Returns its line, which has `count_label` as its label.
     """
     for curve in shown.curves:
         dot = "." if len(curve.epochs) == 1 else ""
@@ -181,7 +181,7 @@ def draw_band(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> Lin
     low, high = shown.edges(axes.get_yscale() == "log", axes.get_ylim()[1])
     axes.fill_between(shown.epochs, low, high, color=stroke.colour, alpha=0.22, lw=0)
     drawn = draw_centre(axes, shown, stroke, **line)
-    drawn.set(label=style.literal(shown.label), gid=printable(f"centre-{shown.label}"))
+    drawn.set(label=count_label(shown), gid=printable(f"centre-{shown.label}"))
     return drawn
 
 

@@ -91,7 +91,8 @@ def collect(
     drawn: dict[str, RunRow] = {}
     curve_of: dict[str, str] = {}
     notes: list[str] = []
-    reached = _reached(store, runs)
+    latest = store.latest_metrics([run.id for run in runs]).sort_values("step")
+    reached = dict(zip(latest["run_id"].tolist(), latest["step"].tolist(), strict=True))  # the last epoch of each run
     for metric in dict.fromkeys(metrics):
         values = store.metrics([run.id for run in runs], names=[metric])
         if not len(values):
@@ -114,12 +115,6 @@ def collect(
     )
 
 
-def _reached(store: Store, runs: Sequence[RunRow]) -> dict[str, int]:
-    """The last epoch that each run recorded, by run id."""
-    latest = store.latest_metrics([run.id for run in runs]).sort_values("step")
-    return dict(zip(latest["run_id"].tolist(), latest["step"].tolist(), strict=True))
-
-
 def _unknown_metric(store: Store, runs: Sequence[RunRow], metric: str) -> InputError:
     """One sentence with the nearest stored names: those with the same last part first."""
     names = sorted(set(store.latest_metrics([run.id for run in runs])["name"]))
@@ -135,7 +130,7 @@ def _groups(runs: Sequence[RunRow], values: pd.DataFrame, group_by: str) -> tupl
     """The groups by rising value, each of one spec; and what was left out."""
     without = silent(runs, values)
     there = [run for run in runs if run not in without]
-    keys = {run.id: _keys(run) for run in runs}
+    keys = {run.id: {**flatten(run.spec), "seed": run.seed} for run in runs}
     if not any(group_by in known for known in keys.values()):
         raise unknown_name("key to group by", group_by, dict.fromkeys(key for known in keys.values() for key in known))
     found: dict[Hashable, list[RunRow]] = {}
@@ -151,10 +146,6 @@ def _groups(runs: Sequence[RunRow], values: pd.DataFrame, group_by: str) -> tupl
     notes = [f"{values['name'].iloc[0]}: {len(without)} of the chosen runs have none."] if without else []
     notes += [f"{counted(older, 'older run')} of the same spec and seed left out."] if older else []
     return groups, notes
-
-
-def _keys(run: RunRow) -> dict[str, Any]:
-    return {**flatten(run.spec), "seed": run.seed}
 
 
 def _hashable(value: Any) -> Hashable:
@@ -227,5 +218,4 @@ def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> d
     handles = {}
     for shown in panel.bands:
         handles[shown.label] = curves.draw_band(axes, shown, strokes[shown.label])
-        handles[shown.label].set_label(curves.count_label(shown))
     return handles

@@ -110,6 +110,7 @@ def make_engine(url: URL) -> Engine:
         dbapi_connection.isolation_level = None  # keeps the driver from starting transactions; `_begin` does
         dbapi_connection.execute("PRAGMA foreign_keys = ON")
         dbapi_connection.execute("PRAGMA trusted_schema = OFF")
+        dbapi_connection.text_factory = _text
 
     @event.listens_for(engine, "begin")
     def _begin(connection: Connection) -> None:
@@ -138,6 +139,8 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
             f"{describe(engine)} was written by a newer ssmail (schema {revision}; this version supports up "
             f"to {REVISIONS[-1]}); upgrade ssmail or use another database"
         )
+    if engine.dialect.name == "sqlite":
+        _refuse_other_tables(connection, describe(engine))
     return str(revision)
 
 
@@ -173,6 +176,22 @@ def _refuse_journal(file: Path) -> None:
         names_another = True
     if names_another:
         raise InputError(f"{file}-journal is not a journal that ssmail leaves behind; do not use these two files")
+
+
+def _text(content: bytes) -> str:
+    """Return a stored text, with surrogates for what is not UTF-8: one such text must not hide all other rows."""
+    return content.decode(errors="surrogateescape")
+
+
+def _refuse_other_tables(connection: Connection, where: str) -> None:
+    """Raise InputError unless the tables of an SQLite file have the columns and primary keys of the schema."""
+    columns = "SELECT m.name, c.name, c.pk > 0 FROM sqlite_master AS m, pragma_table_info(m.name) AS c"
+    found = {tuple(row) for row in connection.exec_driver_sql(f"{columns} WHERE m.type = 'table'")}
+    for name, wanted in metadata.tables.items():
+        if {row for row in found if row[0] == name} != {(name, item.name, item.primary_key) for item in wanted.columns}:
+            raise InputError(
+                f"the table {name} of {where} does not have the columns that ssmail gives it; use a backup of the file"
+            )
 
 
 @contextmanager
@@ -223,8 +242,12 @@ def _upgrade(engine: Engine) -> None:
     config = Config()
     config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
     with writing(engine) as connection:
-        if revision_of(connection, engine) != REVISIONS[-1]:  # another process may have upgraded it meanwhile
-            config.attributes["connection"] = connection
+        config.attributes["connection"] = connection
+        revision = revision_of(connection, engine)
+        if revision is None:
+            metadata.create_all(connection)
+            command.stamp(config, "head")
+        elif revision != REVISIONS[-1]:  # another process may have upgraded it meanwhile
             command.upgrade(config, "head")
 
 

@@ -2,19 +2,20 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Table, func, select
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, select
 
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
 from ssmail.store import schema
 from ssmail.store.schema import RunState
+from ssmail.store.validation import DamagedRow, UnsoundError, raw, sound
 
 HEARTBEAT_SECONDS = 5.0
 """Interval at which a running run records a heartbeat."""
@@ -99,19 +100,47 @@ class ArtifactRow:
     size_bytes: int
 
 
-def runs(connection: Connection, *conditions: Any) -> list[RunRow]:
-    """Return the runs that meet all conditions, newest last."""
-    query = select(schema.run).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
-    rows = connection.execute(query).mappings()
-    return [RunRow(**{**row, "state": RunState(row["state"])}) for row in rows]
+def runs(connection: Connection, *conditions: Any, damaged: set[DamagedRow] | None = None) -> list[RunRow]:
+    """Return the runs that meet all conditions, newest last, without damaged rows, which are added to `damaged`."""
+    query = select(*raw(schema.run)).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
+    return [RunRow(**values) for values in sound_rows(connection, schema.run, query, damaged)]
+
+
+def sound_rows(
+    connection: Connection, table: Table, query: Select[Any], damaged: set[DamagedRow] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a query for the raw columns of `table`; add those that are damaged to `damaged` instead."""
+    for row in connection.execute(query).mappings():
+        try:
+            yield sound(table, row)
+        except UnsoundError as error:
+            if damaged is not None:
+                named = "id" if table is schema.run else "run_id"
+                damaged.add(DamagedRow(table.name, row[named], str(error), row.get("name")))
+
+
+def rows_of(
+    connection: Connection, table: Table, run_id: str, damaged: set[DamagedRow] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield what the run recorded in a table, by name; add damaged rows to `damaged` instead."""
+    query = select(*raw(table)).where(table.c.run_id == run_id).order_by(table.c.name)
+    yield from sound_rows(connection, table, query, damaged)
 
 
 def one_run(connection: Connection, run_id: str) -> RunRow:
     """Return the run with that full id. Raises InputError when there is none."""
-    found = runs(connection, schema.run.c.id == run_id)
+    damaged: set[DamagedRow] = set()
+    found = runs(connection, schema.run.c.id == run_id, damaged=damaged)
+    refuse(damaged)
     if not found:
         raise InputError(f"there is no run {run_id[:8]} in the database; `ssmail runs list` shows the stored runs")
     return found[0]
+
+
+def refuse(damaged: Iterable[DamagedRow]) -> None:
+    """Raise InputError if there is a damaged row."""
+    for row in damaged:
+        raise InputError(f"run {row.run} is damaged ({row.place}{row.reason}); `ssmail db check` shows what to do")
 
 
 def silent_runs(connection: Connection, stale_seconds: float = STALE_SECONDS) -> list[RunRow]:
@@ -133,8 +162,9 @@ def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
     ids = schema.run.c.id
     full = []
     for prefix in (prefix.strip().lower() for prefix in prefixes):
-        query = select(ids).where(ids.startswith(prefix, autoescape=True)).limit(2)
-        found = list(connection.execute(query).scalars()) if prefix else []
+        query = select(ids).where(ids.startswith(prefix, autoescape=True))
+        plain = re.fullmatch(r"[0-9a-f]{1,32}", prefix)
+        found = list(filter(schema.is_run_id, connection.execute(query).scalars())) if plain else []
         if not found:
             raise InputError(f"no run id starts with {prefix!r}; `ssmail runs list` shows the stored runs")
         if len(found) > 1:
@@ -143,16 +173,22 @@ def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
     return full
 
 
+def last_step(connection: Connection, run_id: str) -> int:
+    """Return the last step of which the run has a metric; 0 if there is none."""
+    step = func.coalesce(func.max(cast(schema.metric.c.step, BigInteger)), 0)  # a step may be of any type in SQLite
+    return int(connection.execute(select(step).where(schema.metric.c.run_id == run_id)).scalar_one())
+
+
 def count_rows(connection: Connection, table: Table, *conditions: ColumnElement[bool]) -> int:
     """Return the number of rows of the table that meet the conditions."""
     return int(connection.execute(select(func.count()).select_from(table).where(*conditions)).scalar_one())
 
 
-def artifacts(connection: Connection, run_id: str, root: Path) -> list[ArtifactRow]:
+def artifacts(
+    connection: Connection, run_id: str, root: Path, damaged: set[DamagedRow] | None = None
+) -> list[ArtifactRow]:
     """Return the run's files, by name; `root` is the checkpoint root."""
-    table = schema.artifact
-    query = select(table).where(table.c.run_id == run_id).order_by(table.c.name)
-    rows = connection.execute(query).mappings()
+    rows = rows_of(connection, schema.artifact, run_id, damaged)
     return [ArtifactRow(**{**row, "path": _file_of_run(root, run_id, row["path"])}) for row in rows]
 
 

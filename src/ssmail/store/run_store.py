@@ -11,12 +11,13 @@ import numpy.typing as npt
 from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
 
 from ssmail.config.spec import RunSpec
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, shortened
 from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import checkpoint_root_of, remove_folder, run_folder
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.schema import RunState
+from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
 from ssmail.store.writer import RunWriter
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ class Store:
 
     url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
     checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. stale_seconds: a
-    running run whose last heartbeat is further from now than this counts as dead.
+    running run whose last heartbeat is further from now than this counts as dead. damaged: the damaged rows that were
+    met so far, and left out.
     """
 
     def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS) -> None:
@@ -39,6 +41,7 @@ class Store:
         on_sqlite = engine.dialect.name == "sqlite"
         file = Path(str(engine.url.database)) if on_sqlite else Path("results/ssmail.db").absolute()
         self.checkpoint_root = checkpoint_root_of(file)
+        self.damaged: set[DamagedRow] = set()
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
@@ -66,7 +69,7 @@ class Store:
     ) -> list[RunRow]:
         """Return the runs that meet all given conditions, newest last.
 
-        `ids` are full ids or prefixes. Raises InputError for an unknown or ambiguous id.
+        `ids` are full ids or prefixes. Raises InputError for an id that is unknown, ambiguous, or of a damaged row.
         """
         run = schema.run
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}
@@ -74,7 +77,11 @@ class Store:
         with reading(self._engine) as connection:
             if ids is not None:
                 conditions.append(run.c.id.in_(queries.resolve(connection, ids)))
-            found = queries.runs(connection, *conditions)
+            damaged: set[DamagedRow] = set()
+            found = queries.runs(connection, *conditions, damaged=damaged)
+        if ids is not None:
+            queries.refuse(damaged)
+        self.damaged |= damaged
         return found if self._only is None else [row for row in found if row.id in self._only]
 
     def only(self, run_ids: Iterable[str]) -> Self:
@@ -202,12 +209,13 @@ class Store:
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
 
-        Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed.
+        Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed. A damaged
+        run is deleted too, whatever it says of its process.
         """
         with writing(self._engine) as connection:
             full = queries.resolve(connection, run_ids)
-            for run_id in full:
-                self.require_idle(queries.one_run(connection, run_id))
+            for row in queries.runs(connection, schema.run.c.id.in_(full)):
+                self.require_idle(row)
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
         for run_id in filter(schema.is_run_id, full):
             remove_folder(run_folder(self.checkpoint_root, run_id))
@@ -229,41 +237,63 @@ class Store:
         import pandas as pd  # imported late so that listing runs does not wait for it
 
         run = schema.run
-        query = select(table.c.run_id, run.c.seed, table.c.name, table.c.step, table.c.value, table.c.kind)
+        row = {column.name: column for column in raw(table)}
+        query = select(row["run_id"], run.c.seed, row["name"], row["step"], row["value"], row["kind"])
         query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
         if names is not None:
             query = query.where(table.c.name.in_(list(names)))
         query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
         columns = ["run_id", "seed", "name", "step", "value"]
         with reading(self._engine) as connection:
-            frame = pd.DataFrame(connection.execute(query).all(), columns=[*columns, "kind"])
+            rows = [row for row in connection.execute(query) if self._is_sound(table, *row)]
+        frame = pd.DataFrame(rows, columns=[*columns, "kind"])
         value = frame["value"].astype(float).to_numpy(copy=True)
         for kind in ("nan", "inf", "-inf"):
             value[(frame["kind"] == kind).to_numpy()] = float(kind)
         return frame.assign(value=value).astype({"seed": "int64", "step": "int64"})[columns]
 
+    def _is_sound(self, table: Table, run_id: str, _seed: int, name: Any, step: Any, value: Any, kind: Any) -> bool:
+        fault = metric_fault(name, step, value, kind)
+        if fault is not None:
+            self.damaged.add(DamagedRow(table.name, run_id, fault, name))
+        return fault is None
+
     def array(self, run_id: str, name: str) -> npt.NDArray[Any]:
-        """Return the run's array of that name. Raises InputError, listing the run's arrays, when there is none."""
+        """Return the run's array of that name.
+
+        Raises InputError when there is none, listing the run's arrays, and when it cannot be read.
+        """
         table = schema.array
-        query = select(table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run_id, table.c.name == name)
+        row_of = {column.name: column for column in raw(table)}
+        query = select(row_of["dtype"], row_of["shape"], row_of["data"])
+        query = query.where(table.c.run_id == run_id, table.c.name == name)
         with reading(self._engine) as connection:
-            row = connection.execute(query).one_or_none()
+            row = connection.execute(query).first()
         if row is None:
             existing = ", ".join(self.array_names(run_id)) or "none"
             raise InputError(f"run {run_id[:8]} has no array {name!r}; its arrays: {existing}")
-        return arrays.decode(*row)
+        try:
+            return arrays.decode(*row)
+        except arrays.UnreadableArrayError as error:
+            raise InputError(
+                f"the array {shortened(name, 60)} of run {run_id[:8]} cannot be read: {error}; "
+                "`ssmail db check` shows what to do"
+            ) from None
 
     def array_names(self, run_id: str) -> list[str]:
         """Return the names of the run's arrays, sorted."""
         table = schema.array
         query = select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)
         with reading(self._engine) as connection:
-            return list(connection.execute(query).scalars())
+            names = list(connection.execute(query).scalars())
+        wrong = {DamagedRow(table.name, run_id, "its name is none", name) for name in names if not is_name(name)}
+        self.damaged |= wrong
+        return [name for name in names if is_name(name)]
 
     def artifacts(self, run_id: str) -> list[ArtifactRow]:
         """Return the files that the run recorded, by name."""
         with reading(self._engine) as connection:
-            return queries.artifacts(connection, run_id, self.checkpoint_root)
+            return queries.artifacts(connection, run_id, self.checkpoint_root, self.damaged)
 
 
 def _interrupt(connection: Connection, row: RunRow) -> None:
@@ -289,7 +319,7 @@ def _drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:
     """
     metric, latest = schema.metric, schema.metric_latest
     connection.execute(delete(metric).where(metric.c.run_id == row.id, metric.c.step > step))
-    last = connection.execute(select(func.max(metric.c.step)).where(metric.c.run_id == row.id)).scalar() or 0
+    last = queries.last_step(connection, row.id)
     if last < step:
         raise SsmailError(
             f"the checkpoint of run {row.name} is at epoch {step} but the database ends at epoch {last}; "

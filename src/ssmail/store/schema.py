@@ -17,18 +17,6 @@ def is_run_id(value: object) -> bool:
     return isinstance(value, str) and re.fullmatch(r"[0-9a-f]{32}", value) is not None
 
 
-def hexadecimal(column: str) -> tuple[sa.CheckConstraint, ...]:
-    """Return constraints by which the database, SQLite or PostgreSQL, refuses other values than run ids in a column.
-
-    Databases made by earlier versions, or by someone else, need not have them, so readers check ids too.
-    """
-    conditions = {
-        "sqlite": f"length({column}) = 32 AND {column} NOT GLOB '*[^0-9a-f]*'",
-        "postgresql": f"{column} ~ '^[0-9a-f]{{32}}$'",
-    }
-    return tuple(sa.CheckConstraint(words).ddl_if(dialect=name) for name, words in conditions.items())
-
-
 class RunState(StrEnum):
     """The state of a run. Only a RUNNING run can be written to; INTERRUPTED and FAILED runs can be resumed.
 
@@ -93,7 +81,9 @@ run = sa.Table(
     sa.Column("cpu_seconds", sa.Float, nullable=False),
     sa.Column("peak_memory_bytes", sa.BigInteger),
     sa.Index("run_cell", "spec_hash", "seed"),
-    *hexadecimal("id"),
+    # Databases made by earlier versions, or by someone else, lack these constraints, so readers check ids too.
+    sa.CheckConstraint("length(id) = 32 AND id NOT GLOB '*[^0-9a-f]*'").ddl_if(dialect="sqlite"),
+    sa.CheckConstraint("id ~ '^[0-9a-f]{32}$'").ddl_if(dialect="postgresql"),
 )
 
 

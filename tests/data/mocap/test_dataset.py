@@ -127,6 +127,13 @@ def test_more_frames_than_fit_into_memory(tmp_path: Path, monkeypatch: pytest.Mo
         prepare(folder, wanted)
 
 
+def test_of_many_missing_trials_only_the_first_are_named(tmp_path: Path) -> None:
+    folder = write_subject(tmp_path / "subject", {1: 60})
+    wanted = WANTED.model_copy(update={"train": (1,), "validation": tuple(range(2, 900)), "test": (900,)})
+    with pytest.raises(InputError, match=r"35_08\.amc, 35_09\.amc and 891 more trials; add them, or insist"):
+        prepare(folder, wanted)
+
+
 def test_trials_of_different_size(tmp_path: Path) -> None:
     """A test trial in metres, as if the others were in micrometres."""
     folder = write_subject(tmp_path / "subject", {1: 60, 2: 60, 3: 60})

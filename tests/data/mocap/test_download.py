@@ -17,7 +17,18 @@ from ssmail.data.mocap import download
 from ssmail.data.mocap.source import LARGEST
 from ssmail.errors import InputError, SsmailError
 from tests.data.mocap import misbehaving_site as site_that
-from tests.data.mocap.misbehaving_site import MOTION, NAMES, PAGE, SKELETON, Fetch, Site, assert_whole, cut, status
+from tests.data.mocap.misbehaving_site import (
+    MOTION,
+    NAMES,
+    PAGE,
+    SKELETON,
+    Fetch,
+    Request,
+    Site,
+    assert_whole,
+    cut,
+    status,
+)
 
 CMU = os.environ.get("SSMAIL_CMU_DIR")
 
@@ -145,6 +156,44 @@ def test_a_file_that_comes_compressed_is_refused(fetch: Fetch, site: Site) -> No
     site.misbehaves("35.asf", status(200, gzip.compress(SKELETON), Content_Encoding="gzip"))
     with pytest.raises(SsmailError, match=r"35\.asf comes compressed, which nobody asked for; run the same"):
         fetch()
+
+
+ANSWERS = {
+    "no HTTP": b"hello\r\n\r\n",
+    "nothing": b"",
+    "a long line": b"HTTP/1.1 200 OK\r\nX: " + b"x" * 100_000 + b"\r\n\r\n",
+    "many lines": b"HTTP/1.1 200 OK\r\n" + b"X: x\r\n" * 1000 + b"\r\n",
+    "a wrong length": b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n" + SKELETON,
+    "no number as length": b"HTTP/1.1 200 OK\r\nContent-Length: \x1b[31m\r\n\r\n" + SKELETON,
+    "two lengths": b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\nContent-Length: 6\r\n\r\n" + SKELETON,
+    "an endless chunk": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + b"f" * 100_000,
+    "no number as chunk": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n\x1b[31m\r\n",
+    "a status of its own": b"HTTP/1.1 999 \x1b[31m\r\nContent-Length: 0\r\n\r\n",
+    **{
+        f"redirection to {place[:12]!r}": b"HTTP/1.1 302 Found\r\nContent-Length: 0\r\nLocation: " + place + b"\r\n\r\n"
+        for place in (
+            b"file:///etc/passwd",
+            b"http://[::1",
+            b"http://\xff\xfe/",
+            b"http://" + b"x" * 5000,
+            b"//",
+            b"http://a..b/",
+        )
+    },
+}
+
+
+@pytest.mark.parametrize("answer", ANSWERS.values(), ids=ANSWERS)
+def test_answers_of_a_hostile_site(fetch: Fetch, site: Site, tmp_path: Path, answer: bytes) -> None:
+    def send(request: Request, _: bytes) -> None:
+        request.wfile.write(answer)
+
+    site.misbehaves("35.asf", *[send] * 9)
+    with pytest.raises(SsmailError) as caught:
+        fetch(attempts=2)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) <= 300
+    assert list((tmp_path / "cache" / "35").iterdir()) == []
 
 
 def test_temporary_files_of_killed_downloads_are_deleted_after_a_day(fetch: Fetch, site: Site, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ window is observed and the rest predicted.
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -27,6 +27,7 @@ from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
 
 MOST_TRIALS = 1000
+MOST_SHOWN = 8  # missing trials in a message
 NO_LINES = np.empty((0, 0, 3))  # the centre lines of recorded motion
 Trial = Annotated[int, Field(ge=1, lt=1_000_000)]
 Trials = Annotated[tuple[Trial, ...], Field(min_length=1)]
@@ -122,9 +123,10 @@ def _check_trials(wanted: MocapParameters) -> None:
             seen[trial] = split
 
 
-def _lack(source: Path, subject: int, missing: Iterable[int]) -> str:
-    names = ", ".join(f"{subject:02d}_{trial:02d}.amc" for trial in missing)
-    return f"{source} lacks {names}"
+def _lack(source: Path, subject: int, missing: Sequence[int]) -> str:
+    names = ", ".join(f"{subject:02d}_{trial:02d}.amc" for trial in missing[:MOST_SHOWN])
+    more = len(missing) - MOST_SHOWN
+    return f"{source} lacks {names}{f' and {more} more trials' if more > 0 else ''}"
 
 
 def _split(

@@ -133,7 +133,7 @@ def _stream(url: str, output: str, _: pooch.Pooch, *, timeout: float) -> None:
             response.raise_for_status()
         if status != 200:
             raise SsmailError(f"{url} could not be downloaded: the server answered {status}; {REMEDY}")
-        if not {"content-length", "transfer-encoding"} & {key.lower() for key in response.headers}:
+        if "Transfer-Encoding" not in response.headers and not response.headers.get("Content-Length", "").isdecimal():
             raise SsmailError(f"{url} comes without its length, so a cut connection would not be noticed; {REMEDY}")
         if response.headers.get("Content-Encoding", "identity") != "identity":
             raise SsmailError(f"{url} comes compressed, which nobody asked for; {REMEDY}")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ssmail.evaluation.statistics import Statistic
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots.provenance import Provenance
 from ssmail.store import Store
 
@@ -66,10 +66,12 @@ def draw(
 ) -> Drawn:
     """Collect, draw and save the figure `name` ("fig4") of these runs (ids), or of its default choice.
 
-    Raises what FigureModule.collect and `ssmail.paper.results.save` raise.
+    Raises what FigureModule.collect and save_figure raise.
     """
+    from ssmail.plots.saving import save_figure
+
     module = FIGURES[name]
     record = module.collect(store, runs, profile=profile, statistic=statistic)
     figure = module.draw(record)
-    files = save(name, record, figure, out, formats)
+    files = save_figure(module.stem, record, figure, out, formats)
     return Drawn(module.name, tuple(files), figure, record.provenance, record.notes)

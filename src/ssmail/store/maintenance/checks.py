@@ -1,6 +1,7 @@
 """Checks of a database and its checkpoints. Every problem comes with a remedy; nothing is changed."""
 
 import re
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,16 +10,24 @@ from sqlalchemy import Connection, select
 from sqlalchemy.exc import DBAPIError
 
 from ssmail.config.spec import spec_hash
-from ssmail.errors import InputError, command_line
-from ssmail.store import arrays, queries, schema
+from ssmail.errors import InputError, command_line, shortened
+from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
 from ssmail.store.connection import explained, revision_of
 from ssmail.store.maintenance.sqlite_file import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
+from ssmail.store.validation import DamagedRow, raw
 
 FINAL = "test"
 """Prefix of the names of final metrics."""
+_NO_ID = "typeof(id) <> 'text' OR length(id) <> 32 OR id GLOB '*[^0-9a-f]*'"
+_CHILDREN = {
+    schema.metric: "metrics",
+    schema.metric_latest: "latest metrics",
+    schema.array: "arrays",
+    schema.artifact: "checkpoints",
+}
 _MOST = 20  # problems reported by SQLite's integrity check
 
 
@@ -66,12 +75,14 @@ def _problems(path: Path, connection: Connection, revision: str | None, folders:
         yield Problem("schema", path.name, found, remedy)
         return
     yield from _orphans(path, connection)
-    runs = queries.runs(connection)
-    for examine in (_spec, _final_metrics, _unreadable_arrays, _stale_latest):
-        yield from (problem for run in runs for problem in examine(connection, run))
+    damaged: set[DamagedRow] = set()
+    runs = queries.runs(connection, damaged=damaged)
+    yield from (damaged_run(path, row) for row in sorted(damaged, key=repr))
+    for run in runs:
+        yield from faults_of(connection, run)
     yield from _silent(connection)
     yield from _checkpoints(path, connection, runs)
-    yield from _stray_folders(path, folders, {run.id for run in runs})
+    yield from _stray_folders(path, folders, {run.id for run in runs} | {row.run_id for row in damaged})
 
 
 def _damage(path: Path, reason: str) -> Problem:
@@ -92,14 +103,44 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
         yield Problem("orphans", name, f"{found} in the table {name}", remedy)
 
 
+def damaged_run(path: Path, row: DamagedRow) -> Problem:
+    """Return the problem of a row of the table `run` that no command uses."""
+    kind = "spec" if row.reason.startswith("its spec") else "rows"
+    found = f"run {row.run} is damaged: {row.reason}"
+    if schema.is_run_id(row.run_id):
+        return Problem(kind, row.run_id, found, _again(row.run))
+    statement = f"PRAGMA foreign_keys = ON; DELETE FROM run WHERE {_NO_ID}"
+    remedy = f"run `{command_line('sqlite3', path, statement)}`, which deletes all such runs"
+    return Problem(kind, row.run, found, remedy)
+
+
+def faults_of(connection: Connection, run: RunRow) -> Iterator[Problem]:
+    """Yield what is wrong with the rows of a run, files apart."""
+    for examine in (_spec, _damaged_rows, _final_metrics, _stale_latest):
+        yield from examine(connection, run)
+
+
 def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
     """Check that the stored hash is that of the spec."""
-    try:
-        found = spec_hash(run.spec)
-    except (ValueError, TypeError, AttributeError):  # the text is not JSON, or not a spec
-        found = None
-    if found != run.spec_hash:
-        yield Problem("spec", run.id, f"the spec of run {run.name} does not have the hash {run.spec_hash}", _again(run))
+    if spec_hash(run.spec) != run.spec_hash:
+        found = f"the spec of run {run.name} does not have the hash {shortened(run.spec_hash, 40)}"
+        yield Problem("spec", run.id, found, _again(run.name))
+
+
+def _damaged_rows(connection: Connection, run: RunRow) -> Iterator[Problem]:
+    """Find rows of the run that no command uses; the values of metrics are counted."""
+    for table, kind in _CHILDREN.items():
+        damaged: set[DamagedRow] = set()
+        deque(queries.rows_of(connection, table, run.id, damaged), maxlen=0)
+        rows = sorted(damaged, key=repr)
+        if table is schema.array:
+            texts = [f"the array {row.name} of run {run.name} cannot be read ({row.reason})" for row in rows]
+        elif table is schema.artifact:
+            texts = [f"the checkpoint {row.name} of run {run.name} is damaged ({row.reason})" for row in rows]
+        else:
+            count = f"{len(rows)} of the rows of run {run.name} in the table {table.name}"
+            texts = [f"{count} cannot be read, such as {row.name} ({row.reason})" for row in rows[:1]]
+        yield from (Problem(kind, run.id, text, _again(run.name)) for text in texts)
 
 
 def _final_metrics(connection: Connection, run: RunRow) -> Iterator[Problem]:
@@ -107,32 +148,19 @@ def _final_metrics(connection: Connection, run: RunRow) -> Iterator[Problem]:
     latest = schema.metric_latest
     final = latest.c.name.startswith(FINAL)
     if run.state is RunState.FINISHED and not queries.count_rows(connection, latest, latest.c.run_id == run.id, final):
-        yield Problem("final metrics", run.id, f"run {run.name} is finished without final metrics", _again(run))
-
-
-def _unreadable_arrays(connection: Connection, run: RunRow) -> Iterator[Problem]:
-    table = schema.array
-    query = select(table.c.name, table.c.dtype, table.c.shape, table.c.data).where(table.c.run_id == run.id)
-    for name, *columns in connection.execute(query):
-        try:
-            arrays.decode(*columns)
-        except Exception as error:  # from zlib, JSON or NumPy
-            found = f"the array {name} of run {run.name} cannot be read ({error})"
-            yield Problem("arrays", run.id, found, _again(run))
+        yield Problem("final metrics", run.id, f"run {run.name} is finished without final metrics", _again(run.name))
 
 
 def _stale_latest(connection: Connection, run: RunRow) -> Iterator[Problem]:
     """Check that metric_latest holds the last value of each metric."""
-    columns = ("name", "step", "value", "kind")
-    metric, latest = schema.metric, schema.metric_latest
-    query = select(*(metric.c[key] for key in columns)).where(metric.c.run_id == run.id).order_by(metric.c.step)
-    last = {row.name: tuple(row) for row in connection.execute(query)}
-    query = select(*(latest.c[key] for key in columns)).where(latest.c.run_id == run.id)
-    shown = {row.name: tuple(row) for row in connection.execute(query)}
+    metric = schema.metric
+    query = select(*raw(metric)).where(metric.c.run_id == run.id).order_by(metric.c.step)
+    last = {row["name"]: row for row in queries.sound_rows(connection, metric, query)}
+    shown = {row["name"]: row for row in queries.rows_of(connection, schema.metric_latest, run.id)}
     wrong = sorted(name for name in last.keys() | shown.keys() if last.get(name) != shown.get(name))
     if wrong:
         found = f"the last value of {wrong[0]} of run {run.name} differs from the one in the table metric_latest"
-        yield Problem("latest metrics", run.id, found, _again(run))
+        yield Problem("latest metrics", run.id, found, _again(run.name))
 
 
 def _silent(connection: Connection) -> Iterator[Problem]:
@@ -149,7 +177,8 @@ def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> 
             continue
         for row in queries.artifacts(connection, run.id, checkpoint_root_of(path)):
             if wrong := fault_of(row):
-                remedy = f"copy it from a backup to {row.path}, or {_again(run)}" if row.path else _again(run)
+                again = _again(run.name)
+                remedy = f"copy it from a backup to {row.path}, or {again}" if row.path else again
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 
@@ -186,5 +215,5 @@ def _run_ids(path: Path) -> set[str]:
         return set()
 
 
-def _again(run: RunRow) -> str:
-    return f"delete the run (`{command_line('ssmail', 'runs', 'delete', run.name)}`) and train it again"
+def _again(name: str) -> str:
+    return f"delete the run (`{command_line('ssmail', 'runs', 'delete', name)}`) and train it again"

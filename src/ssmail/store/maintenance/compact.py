@@ -16,6 +16,7 @@ from ssmail.store.connection import connect, reading, writing
 from ssmail.store.maintenance.run_rows import copy_rows
 from ssmail.store.maintenance.sqlite_file import existing, new_file, opened, require_current
 from ssmail.store.queries import RunRow
+from ssmail.store.validation import DamagedRow, shown
 
 Thinning = Callable[[npt.NDArray[Any]], npt.NDArray[Any]]
 """Reduces an array to the part that is wanted."""
@@ -46,6 +47,7 @@ class Compact:
     left_out_metrics: int
     left_out_arrays: int
     left_out_artifacts: int
+    damaged: frozenset[DamagedRow]  # rows that were left out too
 
 
 def settled_cells(runs: Sequence[RunRow]) -> list[RunRow]:
@@ -66,13 +68,14 @@ def export_compact(where: str | Path, target: Path, runs: Sequence[RunRow], want
     with new_file(target.absolute()) as partial:
         connect(partial).dispose()  # creates the tables
         with opened(source) as theirs, opened(partial) as ours, reading(theirs) as there, writing(ours) as here:
+            damaged: set[DamagedRow] = set()
             for run in runs:
-                _copy_run(there, here, run, wanted)
+                _copy_run(there, here, run, wanted, damaged)
             report = _counts(there, here, runs)
         _shrink(partial)
         size = partial.stat().st_size
     thinned = sum(thin is not None for run in runs for thin in wanted.arrays.get(run.id, {}).values())
-    return Compact(path=target, size_bytes=size, runs=len(runs), thinned=thinned, **report)
+    return Compact(path=target, size_bytes=size, runs=len(runs), thinned=thinned, damaged=frozenset(damaged), **report)
 
 
 def _shrink(path: Path) -> None:
@@ -82,22 +85,22 @@ def _shrink(path: Path) -> None:
         connection.execute("VACUUM")
 
 
-def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted) -> None:
+def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted, damaged: set[DamagedRow]) -> None:
     metric, latest, array = schema.metric, schema.metric_latest, schema.array
-    copy_rows(there, here, schema.run, schema.run.c.id == run.id)
+    copy_rows(there, here, schema.run, schema.run.c.id == run.id, damaged=damaged)
     last = select(latest.c.name).where(
         latest.c.run_id == run.id, latest.c.name == metric.c.name, latest.c.step == metric.c.step
     )
     kept = metric.c.name.in_(list(wanted.curves)) | last.exists()
-    copy_rows(there, here, metric, metric.c.run_id == run.id, kept)
-    copy_rows(there, here, latest, latest.c.run_id == run.id)
+    copy_rows(there, here, metric, metric.c.run_id == run.id, kept, damaged=damaged)
+    copy_rows(there, here, latest, latest.c.run_id == run.id, damaged=damaged)
     for name, thin in wanted.arrays.get(run.id, {}).items():
         this = (array.c.run_id == run.id) & (array.c.name == name)
-        copy_rows(there, here, array, this)
+        copy_rows(there, here, array, this, damaged=damaged)
         if thin is not None:
             row = here.execute(select(array.c.dtype, array.c.shape, array.c.data).where(this)).one_or_none()
             if row is None:
-                raise InputError(f"run {run.name} has no array {name!r}")
+                raise InputError(f"run {run.name} has no sound array {shown(name)}")
             here.execute(update(array).where(this).values(**arrays.encode(thin(arrays.decode(*row)))))
 
 

@@ -5,7 +5,7 @@ unfinished one, and of two unfinished ones the one that got further is kept. Of 
 is kept; if they disagree, the disagreement is reported as nondeterminism.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -16,9 +16,11 @@ from ssmail.errors import InputError
 from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root_of, fault_of
 from ssmail.store.connection import connect, reading, writing
+from ssmail.store.maintenance.checks import Problem, damaged_run, faults_of
 from ssmail.store.maintenance.run_rows import Difference, amount, copy_run, first_difference
 from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current, revision
 from ssmail.store.queries import RunRow
+from ssmail.store.validation import DamagedRow
 
 
 class Fate(StrEnum):
@@ -55,6 +57,7 @@ class Merge:
     other: Path
     runs: tuple[MergedRun, ...]
     without_checkpoints: tuple[str, ...]  # ids of copied runs whose recorded files are not all there
+    damaged: tuple[Problem, ...]  # what is wrong with the runs that were left out for it, one problem of each
 
     def count(self, fate: Fate) -> int:
         """Return the number of runs with this fate."""
@@ -69,8 +72,9 @@ class Merge:
 def merge(where: str | Path, other: str | Path) -> Merge:
     """Merge the runs of the database `other`, which is only read, into the one at `where`; create it if necessary.
 
-    The merge is one transaction: if it fails, or the process dies at any moment, the target keeps its contents. Raises
-    InputError when a file cannot be used, when both are the same file, or when one has another schema.
+    Runs with damaged rows are left out. The merge is one transaction: if it fails, or the process dies at any moment,
+    the target keeps its contents. Raises InputError when a file cannot be used, when both are the same file, or when
+    one has another schema.
     """
     source, target = existing(other), file_of(where)
     if target.exists() and source.samefile(target):
@@ -81,7 +85,7 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     connect(target).dispose()  # creates the file, its folder and its tables, or waits for the process that does so
     copies = CheckpointCopies(checkpoint_root_of(source), checkpoint_root_of(target))
     try:
-        merged = _merge(source, target, copies)
+        merged, damaged = _merge(source, target, copies)
         # after the transaction: exchange the checkpoints of runs that the target had before
         copies.place(item.run.id for item in merged if item.enters or item.fate is Fate.ALREADY_THERE)
         copies.commit()
@@ -95,16 +99,17 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     with opened(target) as engine, reading(engine) as connection:
         files = {run_id: queries.artifacts(connection, run_id, copies.target) for run_id in entered}
     incomplete = tuple(run_id for run_id, rows in files.items() if any(fault_of(row) for row in rows))
-    return Merge(target, source, tuple(merged), incomplete)
+    return Merge(target, source, tuple(merged), incomplete, damaged)
 
 
-def _merge(source: Path, target: Path, copies: CheckpointCopies) -> list[MergedRun]:
+def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[MergedRun], tuple[Problem, ...]]:
     """Copy the checkpoints before locking the target; then decide again, and write in one transaction."""
     with opened(source) as theirs, opened(target) as ours:
         with reading(theirs) as there, reading(ours) as here:
-            copies.stage(_wanted_folders(decide_fates(here, there), here, copies))
+            damaged = _damaged(source, here, there)
+            copies.stage(_wanted_folders(decide_fates(here, there, damaged), here, copies))
         with reading(theirs) as there, writing(ours) as here:
-            merged = decide_fates(here, there)
+            merged = decide_fates(here, there, damaged)
             copies.stage(item.run.id for item in merged if item.enters and item.run.state.settled)
             before = {run.id for run in queries.runs(here)}
             replaced = [run_id for item in merged for run_id in item.replaces]
@@ -114,18 +119,38 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies) -> list[MergedR
                     copy_run(there, here, item.run.id)
             copies.place(item.run.id for item in merged if item.enters and item.run.id not in before)
         copies.commit()
-    return merged
+    return merged, tuple(damaged.values())
 
 
-def decide_fates(here: Connection, there: Connection) -> list[MergedRun]:
-    """Decide what happens to each run of `there`, given the runs of `here`."""
+def _damaged(source: Path, here: Connection, there: Connection) -> dict[str, Problem]:
+    """Return a problem of each run of `there` that must not be copied, by its id or what is shown of it."""
+    rows: set[DamagedRow] = set()
+    runs = queries.runs(there, damaged=rows)
+    found = {problem.subject: problem for problem in (damaged_run(source, row) for row in rows)}
+    blocking: set[DamagedRow] = set()
+    queries.runs(here, damaged=blocking)
+    ids = {row.run_id for row in blocking}
+    for run in runs:
+        problem = next(faults_of(there, run), None)
+        if problem is None and run.id in ids:
+            text = f"run {run.name} is damaged in the database that it would be merged into"
+            problem = Problem(
+                "rows", run.id, text, f"delete it there (`ssmail runs delete {run.name}`) and merge again"
+            )
+        if problem is not None:
+            found[run.id] = problem
+    return found
+
+
+def decide_fates(here: Connection, there: Connection, without: Collection[str] = ()) -> list[MergedRun]:
+    """Decide what happens to each run of `there`, but those `without` (ids), given the runs of `here`."""
     ours = queries.runs(here)
     by_id = {run.id: run for run in ours}
     cells: dict[tuple[str, int, str | None], list[RunRow]] = {}
     for run in ours:
         cells.setdefault(run.cell, []).append(run)
     merged = []
-    for run in queries.runs(there):
+    for run in (run for run in queries.runs(there) if run.id not in without):
         rivals = [by_id[run.id]] if run.id in by_id else cells.get(run.cell, [])
         settled = [rival for rival in rivals if rival.state.settled]
         if any(item.is_alive() for item in (run, *rivals)):

@@ -1,11 +1,13 @@
 """The rows that a run recorded: copied to another database, or compared with those of another run."""
 
 from dataclasses import dataclass
+from itertools import islice
 
-from sqlalchemy import ColumnElement, Connection, Table, func, insert, select
+from sqlalchemy import ColumnElement, Connection, Table, insert, select
 
 from ssmail.store import schema
-from ssmail.store.queries import RunRow, count_rows
+from ssmail.store.queries import RunRow, count_rows, last_step, refuse, rows_of, sound_rows
+from ssmail.store.validation import DamagedRow, raw
 
 NOT_COMPARED = ("seconds",)
 """Metrics that depend on the machine and not on the run."""
@@ -35,24 +37,34 @@ class Difference:
     left_out_value: float | str | None
 
 
-def copy_rows(source: Connection, target: Connection, table: Table, *conditions: ColumnElement[bool]) -> None:
-    """Insert the rows of `table` that meet the conditions into the same table of `target`."""
-    for batch in source.execute(select(table).where(*conditions)).mappings().partitions(_BATCH):
-        target.execute(insert(table), [dict(row) for row in batch])
+def copy_rows(
+    source: Connection, target: Connection, table: Table, *conditions: ColumnElement[bool], damaged: set[DamagedRow]
+) -> None:
+    """Insert the rows of `table` that meet the conditions into the same table of `target`.
+
+    Damaged rows are added to `damaged` instead.
+    """
+    rows = sound_rows(source, table, select(*raw(table)).where(*conditions), damaged)
+    while batch := list(islice(rows, _BATCH)):
+        target.execute(insert(table), batch)
 
 
 def copy_run(source: Connection, target: Connection, run_id: str) -> None:
-    """Insert the run with everything it recorded into `target`, which must not contain the run."""
-    copy_rows(source, target, schema.run, schema.run.c.id == run_id)
+    """Insert the run with everything it recorded into `target`, which must not contain the run.
+
+    Raises InputError for a damaged row.
+    """
+    damaged: set[DamagedRow] = set()
+    copy_rows(source, target, schema.run, schema.run.c.id == run_id, damaged=damaged)
     for table in CHILDREN:
-        copy_rows(source, target, table, table.c.run_id == run_id)
+        copy_rows(source, target, table, table.c.run_id == run_id, damaged=damaged)
+    refuse(damaged)
 
 
 def amount(connection: Connection, run_id: str) -> tuple[int, ...]:
     """Return how much the run recorded, as a tuple to compare: its last step, then its rows in each table."""
-    step = select(func.coalesce(func.max(schema.metric.c.step), 0)).where(schema.metric.c.run_id == run_id)
     counts = (count_rows(connection, table, table.c.run_id == run_id) for table in CHILDREN)
-    return (int(connection.execute(step).scalar_one()), *counts)
+    return (last_step(connection, run_id), *counts)
 
 
 def first_difference(here: Connection, kept: RunRow, there: Connection, other: RunRow) -> Difference | None:
@@ -77,9 +89,8 @@ def first_difference(here: Connection, kept: RunRow, there: Connection, other: R
 
 
 def _values(connection: Connection, run_id: str, table: Table) -> Values:
-    query = select(table.c.step, table.c.name, table.c.kind, table.c.value).where(table.c.run_id == run_id)
-    rows = connection.execute(query.where(table.c.name.not_in(NOT_COMPARED)))
-    return {(step, name): (kind, value) for step, name, kind, value in rows}
+    rows = rows_of(connection, table, run_id)
+    return {(row["step"], row["name"]): (row["kind"], row["value"]) for row in rows if row["name"] not in NOT_COMPARED}
 
 
 def _plain(value: Value | None) -> float | str | None:
