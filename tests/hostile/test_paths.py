@@ -116,8 +116,8 @@ def test_only_32_hexadecimal_digits_are_an_id(tmp_path: Path, text: str) -> None
             run_folder(tmp_path, text)
 
 
-@pytest.mark.parametrize("bad", ["A" * 32, "../" + "a" * 29, "a" * 33, ""])
-def test_a_new_database_refuses_other_ids_itself(tmp_path: Path, bad: str) -> None:
+@pytest.mark.parametrize("bad", ["A" * 32, "../" + "a" * 29, "a" * 33, "", "a" * 32 + "\0b", b"a" * 32])
+def test_a_new_database_refuses_other_ids_itself(tmp_path: Path, bad: str | bytes) -> None:
     (run_id,) = stored(tmp_path)
     with (
         closing(sqlite3.connect(tmp_path / "ssmail.db")) as connection,
@@ -249,7 +249,10 @@ def test_a_journal_that_names_another_file_is_refused(tmp_path: Path, precious: 
     magic = bytes.fromhex("d9d505f920a163d7")
     end = name + len(name).to_bytes(4, "big") + sum(name).to_bytes(4, "big") + magic
     (tmp_path / "ssmail.db-journal").write_bytes(magic + bytes(504) + end)
-    assert "ssmail.db-journal is not" in refused(tmp_path, "runs", "list", "--db", tmp_path / "ssmail.db")
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "link.db").symlink_to(tmp_path / "ssmail.db")
+    for place in (tmp_path / "ssmail.db", tmp_path / "link" / "link.db"):
+        assert "ssmail.db-journal is not" in refused(tmp_path, "runs", "list", "--db", place)
     (tmp_path / "ssmail.db-journal").write_bytes(b"")  # negative control: one that SQLite leaves behind
     assert hold(tmp_path, "runs", "list", "--db", tmp_path / "ssmail.db")[0] == 0
     assert is_untouched(precious)

@@ -178,7 +178,7 @@ def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
     check_settled(runs, "test errors")
     first = runs[0]
     for run in runs:
-        differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"][key]]
+        differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"].get(key)]
         if differs:
             raise InputError(
                 f"runs {first.name} and {run.name} differ in forecast.{differs[0]}, so {NAME} cannot compare their "

@@ -60,7 +60,7 @@ def decode(dtype: Any, shape: Any, data: Any) -> npt.NDArray[Any]:
         content = unpacking.decompress(data, size + 1)
     except zlib.error:
         raise UnreadableArrayError("its data cannot be unpacked") from None
-    if len(content) != size or not unpacking.eof:
+    if len(content) != size or not unpacking.eof or unpacking.unused_data:
         raise UnreadableArrayError("its data is not of the size that its shape and dtype say")
     return np.frombuffer(content, dtype=kind).reshape(lengths).copy()
 

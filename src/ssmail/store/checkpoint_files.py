@@ -92,7 +92,7 @@ class CheckpointCopies:
             copies = run_folder(self._staging, run_id)
             try:
                 copies.mkdir(parents=True)
-                for file in sorted(folder.iterdir())[:MOST_FILES]:
+                for file in sorted(folder.iterdir(), key=lambda file: (file.suffix != ".pt", file.name))[:MOST_FILES]:
                     _copy(file, copies / file.name)
             except OSError as error:
                 reason = error.strerror or error

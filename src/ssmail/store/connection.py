@@ -102,7 +102,7 @@ def make_engine(url: URL) -> Engine:
     """Return an engine with ssmail's settings, without checking or upgrading the database."""
     if url.get_backend_name() != "sqlite":
         return create_engine(url, isolation_level="SERIALIZABLE")
-    _refuse_journal(Path(str(url.database)))
+    _refuse_journal(Path(os.path.realpath(str(url.database))))  # SQLite looks beside the file behind a link
     engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
 
     @event.listens_for(engine, "connect")

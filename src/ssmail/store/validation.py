@@ -24,6 +24,8 @@ LONGEST_TEXT = 1_000_000  # characters of a spec or an error
 LARGEST = 2**63 - 1
 _SHOWN = 40  # characters of a value in a message
 _DEEPEST = 16  # levels of a spec
+_READ = ("training", "forecast")  # sections that are read of stored specs
+_NEEDED = ("method", "environment", "profile", "training.epochs")  # of a spec, by whatever version
 _KINDS = ("finite", "nan", "inf", "-inf")
 
 
@@ -179,7 +181,8 @@ def _check_run(values: dict[str, Any]) -> None:
 def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     """Return what is wrong with a stored spec, or None; and its method, environment and profile.
 
-    Keys and choices that this ssmail does not know are not wrong: a later one may have written them.
+    Keys that are missing, and keys and choices that this ssmail does not know, are not wrong: an earlier or a later one
+    may have written them.
     """
     try:
         spec = json.loads(text)
@@ -192,7 +195,7 @@ def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
         RunSpec.model_validate_json(json.dumps(spec))
     except (TypeError, AttributeError, ValidationError) as error:
         problems = error.errors(include_url=False) if isinstance(error, ValidationError) else []
-        serious = [item for item in problems if not _is_of_later_version(item)]
+        serious = [item for item in problems if not _is_of_another_version(item)]
         if serious or not problems:
             key = ".".join(str(part) for part in serious[0]["loc"]) if serious else ""
             where = f" at {shortened(key, _SHOWN)}" if key else ""
@@ -200,13 +203,16 @@ def _examine_spec(text: str) -> tuple[str | None, Any, Any, Any]:
     method, environment, profile = (spec[key] for key in ("method", "environment", "profile"))
     known = method in METHODS and environment in ENVIRONMENTS
     for name in required_sections(method, environment) if known else ():
-        if spec.get(name) is None:
+        if name in _READ and spec.get(name) is None:
             return f"its spec has no section {name}", None, None, None
     return None, method, environment, profile
 
 
-def _is_of_later_version(problem: Mapping[str, Any]) -> bool:
-    kind = problem["type"]
+def _is_of_another_version(problem: Mapping[str, Any]) -> bool:
+    """Return whether a key is unknown, or has an unknown choice, or is one that runs are read without."""
+    kind, key = problem["type"], ".".join(map(str, problem["loc"]))
+    if kind == "missing":
+        return key not in _NEEDED and not key.startswith("forecast.")
     return kind == "extra_forbidden" or (kind == "literal_error" and isinstance(problem["input"], str))
 
 

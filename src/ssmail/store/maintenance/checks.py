@@ -116,7 +116,7 @@ def damaged_run(path: Path, row: DamagedRow) -> Problem:
 
 def faults_of(connection: Connection, run: RunRow) -> Iterator[Problem]:
     """Yield what is wrong with the rows of a run, files apart."""
-    for examine in (_spec, _damaged_rows, _final_metrics, _stale_latest):
+    for examine in (_spec, damaged_rows, _final_metrics, _stale_latest):
         yield from examine(connection, run)
 
 
@@ -127,7 +127,7 @@ def _spec(_connection: Connection, run: RunRow) -> Iterator[Problem]:
         yield Problem("spec", run.id, found, _again(run.name))
 
 
-def _damaged_rows(connection: Connection, run: RunRow) -> Iterator[Problem]:
+def damaged_rows(connection: Connection, run: RunRow) -> Iterator[Problem]:
     """Find rows of the run that no command uses; the values of metrics are counted."""
     for table, kind in _CHILDREN.items():
         damaged: set[DamagedRow] = set()

@@ -16,7 +16,7 @@ from ssmail.errors import InputError
 from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root_of, fault_of
 from ssmail.store.connection import connect, reading, writing
-from ssmail.store.maintenance.checks import Problem, damaged_run, faults_of
+from ssmail.store.maintenance.checks import Problem, damaged_rows, damaged_run, faults_of
 from ssmail.store.maintenance.run_rows import Difference, amount, copy_run, first_difference
 from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current, revision
 from ssmail.store.queries import RunRow
@@ -107,7 +107,8 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[M
     with opened(source) as theirs, opened(target) as ours:
         with reading(theirs) as there, reading(ours) as here:
             damaged = _damaged(source, here, there)
-            copies.stage(_wanted_folders(decide_fates(here, there, damaged), here, copies))
+            merged = _leave_out(decide_fates(here, there, damaged), there, damaged)
+            copies.stage(_wanted_folders(merged, here, copies))
         with reading(theirs) as there, writing(ours) as here:
             merged = decide_fates(here, there, damaged)
             copies.stage(item.run.id for item in merged if item.enters and item.run.state.settled)
@@ -123,23 +124,31 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[M
 
 
 def _damaged(source: Path, here: Connection, there: Connection) -> dict[str, Problem]:
-    """Return a problem of each run of `there` that must not be copied, by its id or what is shown of it."""
+    """Return a problem of each run of `there` that cannot be copied, by its id or what is shown of it."""
     rows: set[DamagedRow] = set()
-    runs = queries.runs(there, damaged=rows)
-    found = {problem.subject: problem for problem in (damaged_run(source, row) for row in rows)}
     blocking: set[DamagedRow] = set()
+    runs = queries.runs(there, damaged=rows)
     queries.runs(here, damaged=blocking)
-    ids = {row.run_id for row in blocking}
+    found = {problem.subject: problem for problem in (damaged_run(source, row) for row in rows)}
     for run in runs:
-        problem = next(faults_of(there, run), None)
-        if problem is None and run.id in ids:
+        if run.id in {row.run_id for row in blocking}:
             text = f"run {run.name} is damaged in the database that it would be merged into"
-            problem = Problem(
-                "rows", run.id, text, f"delete it there (`ssmail runs delete {run.name}`) and merge again"
-            )
-        if problem is not None:
+            found[run.id] = Problem("rows", run.id, text, f"delete it there (`ssmail runs delete {run.name}`)")
+        elif problem := next(damaged_rows(there, run), None):
             found[run.id] = problem
     return found
+
+
+def _leave_out(merged: Sequence[MergedRun], there: Connection, damaged: dict[str, Problem]) -> list[MergedRun]:
+    """Return the runs without those that would enter and contradict themselves, whose problems go to `damaged`."""
+    kept = []
+    for item in merged:
+        problem = next(faults_of(there, item.run), None) if item.enters else None
+        if problem is None:
+            kept.append(item)
+        else:
+            damaged[item.run.id] = problem
+    return kept
 
 
 def decide_fates(here: Connection, there: Connection, without: Collection[str] = ()) -> list[MergedRun]:
