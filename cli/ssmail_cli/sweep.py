@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, SsmailError, sentence
+from ssmail.errors import ExitCode, InputError, sentence
 from ssmail.execution import Resume
 from ssmail_cli.options import is_missing, noting_damage
-from ssmail_cli.output import chosen_format, error_line, note, print_rows
+from ssmail_cli.output import chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.run_table import key_metrics, rows_with_metrics
 
@@ -47,28 +47,19 @@ def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows
 
     A run that was deleted during the sweep, as with the whole database, has failed, whatever its last event says.
     """
+    from ssmail.execution.cells import NO_LONGER_STORED
+
     names = [*key_metrics(cell.spec.environment for cell in sweep), "best_epoch"]
-    stored = {row["id"]: row for row in _rows_still_stored(store, {event.run_id for event in events}, names)}
-    lost = f"its run is no longer in {store.where}: it was deleted, or the database replaced, meanwhile"
+    runs = store.still_stored(event.run_id for event in events if event.run_id)
+    stored = {row["id"]: row for row in (rows_with_metrics(store, runs, names) if runs else ())}
+    without_run = {**dict.fromkeys(next(iter(stored.values()), ())), "run": None, "state": None}
     rows = []
     for labels, event in zip(sweep.values(), events, strict=True):
         row = {**labels, "outcome": event.kind, "message": event.message}
         if event.run_id and event.run_id not in stored and event.kind not in ("failed", "interrupted"):
-            row |= {"outcome": "failed", "message": lost}
-        rows.append(row | stored.get(event.run_id, {"run": None, "state": None}))
+            row |= {"outcome": "failed", "message": NO_LONGER_STORED}
+        rows.append(row | stored.get(event.run_id, without_run))
     return rows
-
-
-def _rows_still_stored(store: "Store", run_ids: set[str | None], names: Sequence[str]) -> Rows:
-    """Return the rows of those of these runs that are in the database which has its name now."""
-    store.close()  # its connections may be to a file that has been removed
-    if is_missing(store.where):
-        return []
-    try:
-        return rows_with_metrics(store, [run for run in store.runs() if run.id in run_ids], names)
-    except SsmailError as error:
-        note(error_line(error))
-        return []
 
 
 def is_interrupted(rows: Rows) -> bool:

@@ -136,3 +136,12 @@ class Chatty(Walk):
         while not (place / f"seed {1 - self.seed}").exists() and time.monotonic() < deadline:
             time.sleep(0.01)
         return (place / f"seed {1 - self.seed}").exists()
+
+
+class Slow(Walk):
+    """Seed 0 takes a second for each epoch."""
+
+    def run_epoch(self) -> dict[str, float]:
+        if self.seed == 0:
+            time.sleep(1)
+        return super().run_epoch()

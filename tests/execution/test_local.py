@@ -17,7 +17,7 @@ from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.local import run_cells
 from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
-from tests.execution.fake_loop import Accidents, Chatty, Endless, Patient, Walk
+from tests.execution.fake_loop import Accidents, Chatty, Endless, Patient, Slow, Walk
 from tests.execution.fake_worker import fake_worker
 from tests.execution.recorded import recorded
 
@@ -176,3 +176,15 @@ def test_input_that_no_process_can_begin_with_is_raised(store: Store, cells: lis
     with pytest.raises(InputError, match=r"last\.pt cannot be read"):
         compute(store, cells[:2], Walk)
     assert len(store.runs()) == 1
+
+
+def test_a_run_that_is_deleted_or_whose_database_is_removed_has_not_finished(store: Store, cells: list[Cell]) -> None:
+    def disturb(event: Event) -> None:
+        if event.kind == "epoch" and event.epoch == 1 and event.cell.seed == 0:
+            for path in Path(store.where).parent.glob(f"{Path(store.where).name}*"):
+                path.unlink()
+
+    final, events = compute(store, cells[:2], Slow, disturb)
+    assert [(event.kind, event.cell.seed) for event in final] == [("failed", 0), ("finished", 1)]
+    assert not any(event.kind == "finished" and event.cell.seed == 0 for event in events)
+    assert [row.seed for row in Store.open(store.where).runs()] == [1]

@@ -1,4 +1,4 @@
-"""The number of cases that were tried, at the end of the run; no settings of the developer."""
+"""The number of cases that were tried and of kills, at the end of the run; no settings of the developer."""
 
 import matplotlib.font_manager  # noqa: F401 (the first import makes folders in the user's home)
 import pytest
@@ -30,3 +30,5 @@ def pytest_testnodedown(node: object) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
     count = config.stash.get(_cases, 0) + harness.counted
     terminalreporter.write_line(f"{count} hostile cases tried")
+    if harness.killed:
+        terminalreporter.write_line(f"{harness.killed} living processes killed")

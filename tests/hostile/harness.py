@@ -37,6 +37,8 @@ CHANGES += ("shutil.rmtree", "shutil.move", "shutil.copyfile", "sqlite3.connect"
 Test = TypeVar("Test", bound=Callable[..., Any])
 counted = 0
 """The cases that this process has run."""
+killed = 0
+"""The living processes that the crash test has killed."""
 
 
 def cases(quick: int, fuzz: int) -> Callable[[Test], Test]:

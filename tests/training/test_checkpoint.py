@@ -3,6 +3,7 @@ import math
 import os
 import random
 import zipfile
+from collections import OrderedDict
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
@@ -153,6 +154,13 @@ def other_counters(state: torch.Tensor) -> torch.Tensor:
     return state
 
 
+def hollow(weights: dict[str, Any]) -> Any:
+    """A dictionary that calls its attributes as its methods are called, as a pickle can build it."""
+    found: Any = OrderedDict.fromkeys(weights, torch.zeros(1))
+    found.__dict__.update(keys=1, items=2, get=3, values=4)
+    return found
+
+
 OPTIMIZER = ("learner", "actor_critic", "optimizers", "actor")
 UNFIT: dict[str, tuple[tuple[Any, ...], Callable[[Any], Any], str]] = {
     # where, what becomes of it there, the complaint
@@ -175,7 +183,8 @@ UNFIT: dict[str, tuple[tuple[Any, ...], Callable[[Any], Any], str]] = {
     "an epoch that is no number": (("epoch",), lambda _: True, "epoch is out of range"),
     "a trajectory from nowhere": (("learner", "replay", "source"), lambda s: s + 10**9, "source is out of range"),
     "an endless replay": (("learner", "replay", "source"), lambda s: s[:1].expand(10**9), "number of trajectories"),
-    "no replay": (("learner", "replay"), lambda _: 5, "number of trajectories"),
+    "no replay": (("learner", "replay"), lambda _: 5, "replay has other entries"),
+    "a dictionary without methods": (("learner", "discriminator"), hollow, "another shape or type"),
     "a missing part": ((), lambda s: {key: value for key, value in s.items() if key != "generators"}, "other entries"),
 }
 

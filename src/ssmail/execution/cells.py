@@ -10,6 +10,8 @@ from ssmail.execution import Resume
 from ssmail.store import HEARTBEAT_SECONDS
 
 Kind = Literal["started", "resumed", "skipped", "epoch", "finished", "failed", "diverged", "interrupted"]
+NO_LONGER_STORED = "its run is no longer in the database: it was deleted, or the database replaced, meanwhile"
+"""What became of a run that ended well but is not stored."""
 _FINAL = ("skipped", "finished", "failed", "diverged", "interrupted")
 
 

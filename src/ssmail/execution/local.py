@@ -10,11 +10,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
-from ssmail.execution.cells import Cell, Event, Job, Kind, RunSettings
+from ssmail.execution.cells import NO_LONGER_STORED, Cell, Event, Job, Kind, RunSettings
 from ssmail.execution.planning import check_labels, plan_cell
 from ssmail.store import HEARTBEAT_SECONDS, RunRow, RunState, Store
 
@@ -187,6 +188,8 @@ class _Pool:
         for event in events or ():
             if event.bad_input and not self._any_started:
                 raise InputError(event.message)
+            if event.kind in ("finished", "diverged") and not self._store.still_stored([str(event.run_id)]):
+                event = replace(event, kind="failed", message=NO_LONGER_STORED)
             self.emit(worker.index, event)
         if events is None:
             self._selector.unregister(worker.stdout)

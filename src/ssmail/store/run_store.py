@@ -90,6 +90,21 @@ class Store:
         other._only = frozenset(run_ids)
         return other
 
+    def still_stored(self, run_ids: Iterable[str]) -> list[RunRow]:
+        """Return those of the runs (full ids) that are in the database which has this name now, newest last.
+
+        There are none when it has been removed, or replaced by what is no database of ssmail.
+        """
+        self.close()  # open connections would still read a file that has been removed
+        if self._engine.dialect.name == "sqlite" and not Path(self.where).exists():
+            return []
+        wanted = set(run_ids)
+        try:
+            with reading(self._engine) as connection:
+                return [row for row in queries.runs(connection) if row.id in wanted]
+        except SsmailError:
+            return []
+
     def find_cell(self, spec_hash: str, seed: int) -> RunRow | None:
         """Return the newest run of the cell, or None."""
         with reading(self._engine) as connection:

@@ -13,7 +13,7 @@ from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_targ
 from ssmail.models.critic import TwinCritic
 from ssmail.models.graph_encoder import graph_entropy
 from ssmail.training.batches import Batch
-from ssmail.training.checkpoint import UnfitState, fitted, load_part
+from ssmail.training.checkpoint import entries, fitted, load_part
 from ssmail.training.optimization import clipped_step
 from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import Generators
@@ -186,14 +186,12 @@ class ActorCritic:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`. Raises UnfitState when it is the state of other networks."""
         own = self.state_dict()
-        if not isinstance(state, dict) or state.keys() != own.keys():
-            raise UnfitState("learner.actor_critic has other entries")
-        if not isinstance(state["optimizers"], dict) or state["optimizers"].keys() != self.optimizers.keys():
-            raise UnfitState("learner.actor_critic.optimizers has other entries")
+        state = entries(state, own, "learner.actor_critic")
+        optimizers = entries(state["optimizers"], self.optimizers, "learner.actor_critic.optimizers")
         for name in ("policy", "critic", "target_critic"):
             load_part(getattr(self, name), state[name], f"learner.actor_critic.{name}")
         for name, optimizer in self.optimizers.items():
-            load_part(optimizer, state["optimizers"][name], f"learner.actor_critic.optimizers.{name}")
+            load_part(optimizer, optimizers[name], f"learner.actor_critic.optimizers.{name}")
         with torch.no_grad():
             where = "learner.actor_critic.log_temperature"
             self.log_temperature.copy_(fitted(state["log_temperature"], own["log_temperature"], where))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Trajectories
-from ssmail.training.checkpoint import UnfitState, fitted
+from ssmail.training.checkpoint import UnfitState, entries, fitted
 
 Arrays = dict[str, np.ndarray]
 """Arrays to store with a run, by name."""
@@ -79,14 +79,15 @@ class ReplayBuffer:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`. Raises UnfitState when it holds no trajectories like those of the experts."""
-        if state == {}:
+        if isinstance(state, dict) and not len(state):
             self.kept = None
             return
-        source = state.get("source") if isinstance(state, dict) else None
+        own = vars(self.experts)
+        source = entries(state, own, "replay")["source"]
         count = len(source) if isinstance(source, Tensor) and source.dim() == 1 else 0
         if not 1 <= count <= self.capacity:
             raise UnfitState("replay has another number of trajectories")
-        expected = {name: value[:1].expand(count, *value.shape[1:]) for name, value in vars(self.experts).items()}
+        expected = {name: value[:1].expand(count, *value.shape[1:]) for name, value in own.items()}
         kept = fitted(state, expected, "replay")
         if not bool(((kept["source"] >= 0) & (kept["source"] < len(self.experts))).all()):
             raise UnfitState("replay.source is out of range")

@@ -12,7 +12,7 @@ import pickle
 import pickletools
 import stat
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -143,14 +143,24 @@ def fitted(found: Any, expected: Any, where: str) -> Any:
     Raises UnfitState, naming the first place that differs.
     """
     if isinstance(expected, Mapping):
-        if not isinstance(found, dict) or found.keys() != expected.keys():
-            raise UnfitState(f"{where} has other entries")
-        return {key: fitted(found[key], value, f"{where}.{key}") for key, value in expected.items()}
+        values = entries(found, expected, where)
+        return {key: fitted(values[key], value, f"{where}.{key}") for key, value in expected.items()}
     if isinstance(expected, Tensor):
         return fitted_tensor(found, expected.shape, expected.dtype, where)
     if type(found) is not type(expected):
         raise UnfitState(f"{where} is of another type")
     return found
+
+
+def entries(found: Any, expected: Iterable[Any], where: str) -> dict[Any, Any]:
+    """Return the entries of the dictionary `found`, whose keys have to be the `expected` ones. Raises UnfitState.
+
+    A file can hold a dictionary whose methods are hidden by attributes of the same name, hence the calls by class.
+    """
+    keys = list(expected)
+    if not isinstance(found, dict) or dict.keys(found) != set(keys):
+        raise UnfitState(f"{where} has other entries")
+    return {key: dict.__getitem__(found, key) for key in keys}
 
 
 def fitted_tensor(found: Any, shape: torch.Size, dtype: torch.dtype, where: str) -> Tensor:
@@ -180,16 +190,16 @@ def _fitted_optimizer(found: Any, optimizer: torch.optim.Optimizer, where: str) 
     A parameter that has never had a gradient has no moments.
     """
     own = optimizer.state_dict()
-    if not isinstance(found, dict) or found.keys() != own.keys() or not isinstance(found["state"], dict):
-        raise UnfitState(f"{where} has other entries")
-    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
-    if not all(type(index) is int and 0 <= index < len(parameters) for index in found["state"]):
+    moments = entries(found, own, where)["state"]
+    parameters = [parameter.detach() for group in optimizer.param_groups for parameter in group["params"]]
+    indices = range(len(parameters))
+    if not isinstance(moments, dict) or not all(type(key) is int and key in indices for key in dict.keys(moments)):
         raise UnfitState(f"{where} has other parameters")
     state = {}
-    for index, moments in found["state"].items():
-        like = parameters[index].detach()
+    for index, values in dict.items(moments):
+        like = parameters[index]
         expected = {"step": torch.zeros((), dtype=torch.float32), "exp_avg": like, "exp_avg_sq": like}
-        state[index] = fitted(moments, expected, f"{where}.{index}")
+        state[index] = fitted(values, expected, f"{where}.{index}")
         fitted_number(float(state[index]["step"]), 0.0, 2.0**24, f"{where}.{index}.step")
     return {"state": state, "param_groups": own["param_groups"]}
 

@@ -20,7 +20,7 @@ from ssmail.errors import SsmailError
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
 from ssmail.training.batches import Arrays, Batch
-from ssmail.training.checkpoint import UnfitState, fitted, fitted_number, load_part
+from ssmail.training.checkpoint import UnfitState, entries, fitted, fitted_number, load_part
 from ssmail.training.cloning import CloningLearner
 from ssmail.training.evaluators import make_evaluator
 from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
@@ -135,15 +135,13 @@ class TrainingLoop:
         Raises UnfitState when the state is not one of such a loop; some of it may be loaded by then.
         """
         own, parts = self.state_dict(), self.learner.parts()
-        if state.keys() != own.keys() or not isinstance(state["learner"], dict):
-            raise UnfitState("it has other entries")
-        if state["learner"].keys() != parts.keys():
-            raise UnfitState("learner has other entries")
+        state = entries(state, own, "it")
+        learner = entries(state["learner"], parts, "learner")
         self.epoch, self.snapshot = fitted_number(state["epoch"], 0, self.spec.epochs, "epoch"), {}
         self.best = fitted(state["best"], own["best"], "best")
         fitted_number(self.best["epoch"], 0, self.epoch, "best.epoch")
         for name, part in parts.items():
-            load_part(part, state["learner"][name], f"learner.{name}")
+            load_part(part, learner[name], f"learner.{name}")
         self.generators.load_state_dict(state["generators"])
         if not self._is_finite():
             raise UnfitState("a weight is not finite")

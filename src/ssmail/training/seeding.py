@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ssmail.training.checkpoint import UnfitState, fitted_generator
+from ssmail.training.checkpoint import entries, fitted_generator
 
 PURPOSES = ("data", "weights", "policy", "alpha", "curriculum", "evaluation")
 
@@ -30,7 +30,6 @@ class Generators:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Inverse of `state_dict`, for the same seed. Raises UnfitState when it is another one, or no such state."""
-        if not isinstance(state, dict) or state.keys() != self.by_purpose.keys():
-            raise UnfitState("generators has other entries")
+        state = entries(state, self.by_purpose, "generators")
         for purpose, generator in self.by_purpose.items():
             generator.set_state(fitted_generator(state[purpose], generator, f"generators.{purpose}"))

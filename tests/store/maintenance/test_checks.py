@@ -57,7 +57,7 @@ def test_the_checkpoint_of_a_run_at_work_may_change(store: Store) -> None:
     path = store.checkpoint_root / writer.run_id / "last.pt"
     path.parent.mkdir(parents=True)
     path.write_bytes(b"one")
-    writer.artifact("last.pt", path)
+    writer.artifact("last.pt")
     path.write_bytes(b"two")
     assert check(store.where) == []
     writer.finish(RunState.INTERRUPTED)
