@@ -90,7 +90,7 @@ def as_url(where: str | Path) -> URL:
     Raises InputError when `where` is neither, or is a folder.
     """
     if isinstance(where, Path) or "://" not in where:
-        return _file_url(Path(where).expanduser())
+        return _file_url(where)
     try:
         url = make_url(where)
     except (ArgumentError, ValueError):
