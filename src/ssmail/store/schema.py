@@ -82,9 +82,9 @@ run = sa.Table(
     sa.Column("peak_memory_bytes", sa.BigInteger),
     sa.Index("run_cell", "spec_hash", "seed"),
     # Databases made by earlier versions, or by someone else, lack these constraints, so readers check ids too.
-    sa.CheckConstraint(
-        "typeof(id) = 'text' AND length(CAST(id AS BLOB)) = 32 AND id NOT GLOB '*[^0-9a-f]*'"
-    ).ddl_if(dialect="sqlite"),
+    sa.CheckConstraint("typeof(id) = 'text' AND length(CAST(id AS BLOB)) = 32 AND id NOT GLOB '*[^0-9a-f]*'").ddl_if(
+        dialect="sqlite"
+    ),
     sa.CheckConstraint("id ~ '^[0-9a-f]{32}$'").ddl_if(dialect="postgresql"),
 )
 
