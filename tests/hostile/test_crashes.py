@@ -98,7 +98,7 @@ SCENARIOS = {f"train {method} on {where}": training(method, where) for method in
         ("runs", "export", "--out", "runs.csv", "--db", "other/ssmail.db"), kills=4, prepared=("other",)
     ),
 }
-IN_PROCESSES = {False: 3, True: 3}  # kills, by whether the workers are killed as well
+IN_PROCESSES = {False: 5, True: 1}  # kills, by whether the workers are killed as well
 
 
 def test_there_are_a_hundred_kills() -> None:
