@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssmail.config.sections import DataSpec, YJunctionSpec
+from ssmail.config.sections import YJunctionSpec
 from ssmail.data import expert_sets, yjunction
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.data.trajectories import ExpertSet
@@ -37,13 +37,6 @@ def test_round_trip(saved: Path) -> None:
     assert read.parameters == made.parameters
     np.testing.assert_array_equal(read.validation.continuations, made.validation.continuations)
     assert list(saved.parent.iterdir()) == [saved], "no temporary file is left"
-
-
-@pytest.mark.parametrize("change", [{"train": 10**400}, {"test": 10**9}, {"steps": 10**12}, {"agents": 10**10}])
-def test_a_set_too_large_for_a_file_is_not_generated(change: dict[str, int]) -> None:
-    data = DataSpec(path=None, yjunction=PARAMS.model_copy(update=change), letters=None)
-    with pytest.raises(InputError, match=r"would have more than 2 GB; lower data\.yjunction\.train, validation, test"):
-        expert_sets.generate(data)
 
 
 def test_refuses_to_overwrite(saved: Path) -> None:

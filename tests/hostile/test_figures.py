@@ -17,11 +17,12 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from ssmail.config.experiments import build_spec
-from ssmail.paper.results import FIGURES, save
+from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance, training_curves
 from ssmail.plots.saving import save_figure, save_film
 from ssmail.store import RunState, Store
 from tests.hostile.harness import cases, hold, mutated, refused
+from tests.paper.figure_files import save
 
 FORMATS = ("png", "pdf", "svg")
 

@@ -54,24 +54,12 @@ DIGEST = re.compile("[0-9a-f]{64}")
 def generate(data: DataSpec) -> ExpertSet:
     """Generate the expert set of the environment in spec.GENERATED_ENVIRONMENTS whose parameters `data` has.
 
-    Raises InputError for parameters that no set can have, or only one that is too large for a file.
+    Raises InputError for parameters that no set can have.
     """
     if data.letters is not None:
-        _check_size("letters", data.letters, len(data.letters.word), arrays=2)
         return letters.generate(data.letters)
     assert data.yjunction is not None
-    _check_size("yjunction", data.yjunction, data.yjunction.agents, arrays=2 + len(yjunction.LANES))
     return yjunction.generate(data.yjunction)
-
-
-def _check_size(environment: str, params: LettersSpec | YJunctionSpec, agents: int, arrays: int) -> None:
-    """Raise InputError if the `arrays` (B, T, N, 2) of all splits would be too large for a file."""
-    size = 8 * 2 * arrays * params.steps * agents * sum(getattr(params, split) for split in SPLITS)
-    if size > LARGEST_FILE:
-        raise InputError(
-            f"the expert set would have more than {LARGEST_FILE >> 30} GB; lower data.{environment}.train, validation, "
-            "test or steps"
-        )
 
 
 def check_target(path: Path, *, force: bool) -> None:
