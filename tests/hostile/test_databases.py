@@ -270,3 +270,31 @@ def test_every_command_takes_the_sound_database(original: Path, tmp_path: Path, 
         code, out, err = hold(tmp_path, *words, "--db", database)
     assert code == 0 or command[0] in ("plot", "report"), (code, out, err)
     assert "damaged" not in out + err
+
+
+REFERENCE = Path(__file__).parents[2] / "results" / "reference" / "reference.db"
+UNFIT = {
+    "flat": lambda array: array.reshape(-1),
+    "scalar": lambda array: np.array(1.0),
+    "empty": lambda array: array[..., :0] if array.ndim else array,
+    "nan": lambda array: array * np.float32("nan"),
+}
+
+
+@pytest.mark.parametrize("unfit", UNFIT)
+@pytest.mark.filterwarnings("ignore")
+def test_arrays_that_do_not_fit_what_is_drawn(unfit: str, tmp_path: Path) -> None:
+    """Each is sound by itself, so it shows only where it is used."""
+    matplotlib.get_configdir(), matplotlib.get_cachedir()
+    database = tmp_path / "ssmail.db"
+    shutil.copyfile(REFERENCE, database)
+    with closing(sqlite3.connect(database)) as connection, connection:
+        for row, *stored in connection.execute("SELECT rowid, dtype, shape, data FROM array").fetchall():
+            new = arrays.encode(np.asarray(UNFIT[unfit](arrays.decode(*stored))))
+            connection.execute("UPDATE array SET dtype = :dtype, shape = :shape, data = :data WHERE rowid = :row",
+                               {**new, "row": row})  # fmt: skip
+    for figure in ("fig2", "fig5"):
+        sentence = refused(tmp_path, "plot", "--out", tmp_path / "out", figure, "--db", database)
+        assert f"what is stored of {figure} does not fit together" in sentence
+    code, out, _ = hold(tmp_path, "claims", "--db", database)
+    assert (code in (0, 3), len(out.splitlines()) >= 9) == (True, True), (code, out)

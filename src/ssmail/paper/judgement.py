@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from ssmail.errors import InputError, command_line, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
-from ssmail.paper.results import CLAIMS, FIGURES
+from ssmail.paper.results import CLAIMS, FIGURES, FigureModule
 from ssmail.paper.samples import Runs
 from ssmail.store import Store
 
@@ -47,23 +47,25 @@ def judge(store: Store, profile: str | None = None, only: Sequence[str] | None =
         if name not in names:
             raise unknown_name("claim", name, names)
     wanted = {names[name] for name in only} if only else set(names.values())
-    found = [_runs(store, figure.name, profile) for figure in figures]
-    decisions = [Decision(figure.decide(runs)) for figure, (runs, _) in zip(figures, found, strict=True)]
-    adjusted = holm([decision.p for decision in decisions])
+    found = [_decided(store, figure, profile) for figure in figures]
+    adjusted = holm([decision.p for *_, decision in found])
     return [
         _judgement(figure.claim, runs, notes, decision, p, profile)
-        for figure, (runs, notes), decision, p in zip(figures, found, decisions, adjusted, strict=True)
+        for figure, (runs, notes, decision), p in zip(figures, found, adjusted, strict=True)
         if figure.claim.name in wanted
     ]
 
 
-def _runs(store: Store, figure: str, profile: str | None) -> tuple[Runs, tuple[str, ...]]:
-    """The figure's runs, with notes. Runs that cannot be compared are left out; the note then states why."""
+def _decided(store: Store, figure: FigureModule, profile: str | None) -> tuple[Runs, tuple[str, ...], Decision]:
+    """The figure's runs, notes, and what they decide.
+
+    Runs that cannot be compared, or whose arrays cannot be read, are left out; the note then states why.
+    """
     try:
-        runs = Runs.of_figure(store, figure, profile)
+        runs = Runs.of_figure(store, figure.name, profile)
+        return runs, runs.selection.notes, Decision(figure.decide(runs))
     except InputError as error:
-        return Runs(store), (str(error),)
-    return runs, runs.selection.notes
+        return Runs(store), (str(error),), Decision(figure.decide(Runs(store)))
 
 
 def _judgement(

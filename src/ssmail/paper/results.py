@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from ssmail.errors import stored_values
 from ssmail.plots import FigureRecord
 
 if TYPE_CHECKING:
@@ -59,11 +60,13 @@ class FigureModule:
             options["statistic"] = statistic
         if self.has_environment and environment is not None:
             options["environment"] = environment
-        return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
+        with stored_values(self.name):
+            return cast(FigureRecord, self._module().collect(store, runs, profile=profile, **options))
 
     def draw(self, record: FigureRecord) -> "Figure":
         """Draw the record as a matplotlib Figure, one column wide."""
-        return cast("Figure", self._module().draw(record))
+        with stored_values(self.name):
+            return cast("Figure", self._module().draw(record))
 
     @property
     def claim(self) -> "Claim":
@@ -73,7 +76,8 @@ class FigureModule:
     def decide(self, runs: "Runs") -> "tuple[Part, ...]":
         """Test the parts of the claim on the figure's runs."""
         module = self._module()
-        return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
+        with stored_values(self.name):
+            return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
 
     @property
     def reads(self) -> "Reads":
