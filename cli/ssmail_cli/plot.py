@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from ssmail.errors import ExitCode, InputError, unknown_name
+from ssmail.errors import ExitCode, InputError, stored_values, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
 from ssmail_cli.options import open_store, parse_statistic
@@ -242,8 +242,9 @@ def training(
     statistic, store = parse_statistic(stat) or Statistic.MEAN_STD, open_store(ctx.obj.db)
     chosen = _training_runs(store, methods, ids=runs, environment=environment, profile=profile)
     metrics = metrics or list(dict.fromkeys(environment_metrics(run.environment).curve for run in chosen))
-    record = training_curves.collect(store, chosen, metrics, group_by, statistic)
-    ctx.obj.save("training", record.stem, record, training_curves.draw(record))
+    with stored_values("these runs"):
+        record = training_curves.collect(store, chosen, metrics, group_by, statistic)
+        ctx.obj.save("training", record.stem, record, training_curves.draw(record))
 
 
 def _training_runs(store: "Store", methods: Sequence[str] | None, **conditions: Any) -> "list[RunRow]":
@@ -271,8 +272,9 @@ def landscape(
     """The learned reward of a run on a plane, after one epoch."""
     from ssmail.plots import landscape_film
 
-    record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.LANDSCAPE, epoch)
-    ctx.obj.save("landscape", record.stem, record, landscape_film.draw(record))
+    with stored_values(f"run {run}"):
+        record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.LANDSCAPE, epoch)
+        ctx.obj.save("landscape", record.stem, record, landscape_film.draw(record))
 
 
 @app.command(epilog=EPILOG)
@@ -280,9 +282,10 @@ def film(ctx: typer.Context, run: OneRun) -> None:
     """The learned reward of a run on a plane, over training (GIF)."""
     from ssmail.plots import landscape_film
 
-    record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.FILM)
-    _print_notes("film", record)
-    say(landscape_film.save_film(record, ctx.obj.out))
+    with stored_values(f"run {run}"):
+        record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.FILM)
+        _print_notes("film", record)
+        say(landscape_film.save_film(record, ctx.obj.out))
 
 
 @app.command(epilog=EPILOG)

@@ -4,9 +4,11 @@ Each message is one sentence that names the cause and the remedy.
 """
 
 import difflib
+import os
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 
 LONGEST = 300
@@ -43,6 +45,26 @@ class InputError(SsmailError):
     """A value, file, key or path from the user cannot be used."""
 
     exit_code = ExitCode.BAD_INPUT
+
+
+@contextmanager
+def stored_values(subject: str) -> Iterator[None]:
+    """Turn errors of a computation with stored values into an InputError about what is stored of `subject`.
+
+    Rows are checked one by one as they are read. That arrays have the shapes and values that a figure needs, and fit
+    each other, shows only when they are used. With SSMAIL_DEBUG=1 the error is raised as it is, for it may be a mistake
+    of ssmail's own.
+    """
+    try:
+        yield
+    except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+        if os.environ.get("SSMAIL_DEBUG"):
+            raise
+        reason = shortened(f"{type(error).__name__}: {error}", 100)
+        raise InputError(
+            f"what is stored of {subject} does not fit together ({reason}); leave out the run that is to blame, or "
+            "train it again"
+        ) from error
 
 
 def printable(text: object) -> str:

@@ -128,3 +128,26 @@ def test_what_is_no_sqlite_file_of_ssmails_is_one_sentence(line: str, cli: Comma
         assert "there is no database" in cli("db", *words, "--db", tmp_path / "missing.db").sentence
         assert not (tmp_path / "missing.db").exists()
     assert not (tmp_path / "new.db").exists()
+
+
+def test_damaged_rows_are_noted_once(cli: CommandLine, filled: Path, tmp_path: Path) -> None:
+    change(filled, "UPDATE run SET state = 'paused' WHERE seed = 0")
+    for command in (
+        ("runs", "list"),
+        ("runs", "compare"),
+        ("claims",),
+        ("db", "export", "--compact", tmp_path / "x.db"),
+    ):
+        found = cli(*command, "--db", filled)
+        (remark,) = (line for line in found.err.splitlines() if "damaged" in line)
+        assert remark == f"1 damaged row left out; `ssmail db check --db {filled}` says what is wrong"
+    damaged = next(str(row[0]) for row in contents(filled)["run"] if "paused" in row)
+    assert f"run {damaged[:8]} is damaged: its state is 'paused'" in cli("db", "check", "--db", filled).out
+    assert (
+        f"run {damaged[:8]} is damaged (its state is 'paused')" in cli("runs", "show", damaged, "--db", filled).sentence
+    )
+    merged = cli("db", "merge", filled, "--db", tmp_path / "own.db")
+    assert merged.out.startswith(f"left out: run {damaged[:8]} is damaged: its state is 'paused'\n")
+    assert "1 run left out: damaged" in merged.out
+    assert cli("runs", "delete", "--yes", damaged, "--db", filled).code == 0
+    assert cli("db", "check", "--db", filled).code == 0

@@ -17,8 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.config.experiments import build_spec
-from ssmail.store import RunState, Store
-from tests.hostile.harness import cases, hold, mutated
+from ssmail.store import RunState, Store, arrays
+from tests.hostile.harness import cases, hold, mutated, refused
 
 RUN = "{run}"  # in a command: the id of the first run
 COMMANDS = (
@@ -161,7 +161,7 @@ def use(original: Path, database: Path, data: st.DataObject) -> None:
     """Give the database to a command, or merge it into one's own, which stays sound and readable."""
     folder = database.parent
     with contextlib.chdir(folder):
-        command = data.draw(st.sampled_from([*(4 * [item for item in COMMANDS if item[0] not in SLOW]), *COMMANDS]))
+        command = data.draw(st.sampled_from([*(8 * [item for item in COMMANDS if item[0] not in SLOW]), *COMMANDS]))
         if data.draw(st.integers(0, 4)):
             words = [first_run(original) if word == RUN else word for word in command]
             hold(folder, *words, "--db", database)
@@ -192,7 +192,7 @@ def start(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "ssmail.db"
 
 
-@cases(quick=50, fuzz=1600)
+@cases(quick=12, fuzz=1600)
 @given(data=st.data())
 def test_hostile_cells(original: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     database = start(original, tmp_path_factory)
@@ -205,7 +205,7 @@ def test_hostile_cells(original: Path, tmp_path_factory: pytest.TempPathFactory,
     use(original, database, data)
 
 
-@cases(quick=20, fuzz=500)
+@cases(quick=6, fuzz=500)
 @given(data=st.data())
 def test_hostile_specs(original: Path, tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     database = start(original, tmp_path_factory)
@@ -213,7 +213,7 @@ def test_hostile_specs(original: Path, tmp_path_factory: pytest.TempPathFactory,
     use(original, database, data)
 
 
-@cases(quick=20, fuzz=700)
+@cases(quick=6, fuzz=700)
 @given(seed=st.integers(0, 2**32), data=st.data())
 def test_mutated_files(
     original: Path, tmp_path_factory: pytest.TempPathFactory, seed: int, data: st.DataObject
@@ -244,7 +244,7 @@ SCHEMAS = st.one_of(
 )  # fmt: skip
 
 
-@cases(quick=20, fuzz=400)
+@cases(quick=6, fuzz=400)
 @given(change=SCHEMAS, data=st.data())
 def test_other_tables(
     original: Path, tmp_path_factory: pytest.TempPathFactory, change: Any, data: st.DataObject
@@ -270,3 +270,31 @@ def test_every_command_takes_the_sound_database(original: Path, tmp_path: Path, 
         code, out, err = hold(tmp_path, *words, "--db", database)
     assert code == 0 or command[0] in ("plot", "report"), (code, out, err)
     assert "damaged" not in out + err
+
+
+REFERENCE = Path(__file__).parents[2] / "results" / "reference" / "reference.db"
+UNFIT = {
+    "flat": lambda array: array.reshape(-1),
+    "scalar": lambda array: np.array(1.0),
+    "empty": lambda array: array[..., :0] if array.ndim else array,
+    "nan": lambda array: array * np.float32("nan"),
+}
+
+
+@pytest.mark.parametrize("unfit", UNFIT)
+@pytest.mark.filterwarnings("ignore")
+def test_arrays_that_do_not_fit_what_is_drawn(unfit: str, tmp_path: Path) -> None:
+    """Each is sound by itself, so it shows only where it is used."""
+    matplotlib.get_configdir(), matplotlib.get_cachedir()
+    database = tmp_path / "ssmail.db"
+    shutil.copyfile(REFERENCE, database)
+    with closing(sqlite3.connect(database)) as connection, connection:
+        for row, *stored in connection.execute("SELECT rowid, dtype, shape, data FROM array").fetchall():
+            new = arrays.encode(np.asarray(UNFIT[unfit](arrays.decode(*stored))))
+            connection.execute("UPDATE array SET dtype = :dtype, shape = :shape, data = :data WHERE rowid = :row",
+                               {**new, "row": row})  # fmt: skip
+    for figure in ("fig2", "fig5"):
+        sentence = refused(tmp_path, "plot", "--out", tmp_path / "out", figure, "--db", database)
+        assert f"what is stored of {figure} does not fit together" in sentence
+    code, out, _ = hold(tmp_path, "claims", "--db", database)
+    assert (code in (0, 3), len(out.splitlines()) >= 9) == (True, True), (code, out)

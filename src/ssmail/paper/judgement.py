@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ssmail.errors import command_line, unknown_name
+from ssmail.errors import InputError, command_line, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
-from ssmail.paper.results import CLAIMS, FIGURES
+from ssmail.paper.results import CLAIMS, FIGURES, FigureModule
 from ssmail.paper.samples import Runs
+from ssmail.plots.run_groups import Selection
 from ssmail.store import Store
 
 FIRST_SEEDS = 5  # to train for a claim that has no runs yet
@@ -47,14 +48,23 @@ def judge(store: Store, profile: str | None = None, only: Sequence[str] | None =
         if name not in names:
             raise unknown_name("claim", name, names)
     wanted = {names[name] for name in only} if only else set(names.values())
-    found = [Runs.of_figure(store, figure.name, profile) for figure in figures]
-    decisions = [Decision(figure.decide(runs)) for figure, runs in zip(figures, found, strict=True)]
-    adjusted = holm([decision.p for decision in decisions])
+    found = [_decided(store, figure, profile) for figure in figures]
+    adjusted = holm([decision.p for _, decision in found])
     return [
         _judgement(figure.claim, runs, decision, p, profile)
-        for figure, runs, decision, p in zip(figures, found, decisions, adjusted, strict=True)
+        for figure, (runs, decision), p in zip(figures, found, adjusted, strict=True)
         if figure.claim.name in wanted
     ]
+
+
+def _decided(store: Store, figure: FigureModule, profile: str | None) -> tuple[Runs, Decision]:
+    """The figure's runs, and what they decide; no runs, with a note, where their arrays cannot be read."""
+    runs = Runs.of_figure(store, figure.name, profile)
+    try:
+        return runs, Decision(figure.decide(runs))
+    except InputError as error:
+        without = Runs(store, Selection((), (str(error),)))
+        return without, Decision(figure.decide(without))
 
 
 def _judgement(claim: Claim, runs: Runs, decision: Decision, p_holm: float, profile: str | None) -> Judgement:

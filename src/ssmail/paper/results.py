@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+from ssmail.errors import stored_values
 from ssmail.plots import FigureRecord
 
 if TYPE_CHECKING:
@@ -58,17 +59,18 @@ class FigureModule:
         from ssmail.plots.series import select, select_data
 
         module = self._module()
-        if self.of_data:
-            return cast(
-                FigureRecord, module.collect(store, select_data(store, self.name, {*self.reads.arrays}, runs, profile))
-            )
-        selection = select(store, self.name, runs, profile, environment if self.has_environment else None)
         options = [statistic or Statistic.MEAN_STD] if self.has_statistic else []
-        return cast(FigureRecord, module.collect(store, selection, *options))
+        with stored_values(self.name):
+            if self.of_data:
+                selection = select_data(store, self.name, {*self.reads.arrays}, runs, profile)
+            else:
+                selection = select(store, self.name, runs, profile, environment if self.has_environment else None)
+            return cast(FigureRecord, module.collect(store, selection, *options))
 
     def draw(self, record: FigureRecord) -> "Figure":
         """Draw the record as a matplotlib Figure, one column wide."""
-        return cast("Figure", self._module().draw(record))
+        with stored_values(self.name):
+            return cast("Figure", self._module().draw(record))
 
     @property
     def claim(self) -> "Claim":
@@ -78,7 +80,8 @@ class FigureModule:
     def decide(self, runs: "Runs") -> "tuple[Part, ...]":
         """Test the parts of the claim on the figure's runs."""
         module = self._module()
-        return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
+        with stored_values(self.name):
+            return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))
 
     @property
     def reads(self) -> "Reads":
