@@ -70,10 +70,9 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
             rollouts = np.zeros((1, 2, 3, 2, 2), np.float32)
             names = ("test/expert", "test/lane", "test/centre_lines", "test/rollouts")
             writer.arrays(dict.fromkeys(names, rollouts))
-            checkpoint = folder / "checkpoints" / writer.run_id / "best.pt"
-            checkpoint.parent.mkdir(parents=True)
-            checkpoint.write_bytes(b"weights")
-            writer.artifact("best.pt", checkpoint)
+            writer.folder.mkdir(parents=True)
+            (writer.folder / "best.pt").write_bytes(b"weights")
+            writer.artifact("best.pt")
         writer.finish(state, None if state is RunState.FINISHED else f"it {state}")
     store.close()
     with closing(sqlite3.connect(folder / "ssmail.db", isolation_level=None)) as connection:

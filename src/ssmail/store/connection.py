@@ -20,6 +20,8 @@ from ssmail.errors import InputError, SsmailError, masked, shortened
 from ssmail.store.schema import REVISIONS, metadata
 
 BUSY_SECONDS = 120.0
+DRIVER_ERRORS = (DBAPIError, sqlite3.Error, UnicodeDecodeError)
+"""What using a database raises; a UnicodeDecodeError about a damaged name in the schema, or SQLite's message on it."""
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # how a journal ends that names another file (SQLite's file format)
 BACKENDS = ("sqlite", "postgresql")
 DRIVERS = (
@@ -210,12 +212,15 @@ def explained_errors(where: str) -> Iterator[None]:
     """Turn errors of the database driver into an SsmailError that explains them in one sentence."""
     try:
         yield
-    except (DBAPIError, sqlite3.Error) as error:
-        raise explained(str(error.orig if isinstance(error, DBAPIError) else error), where) from error
+    except DRIVER_ERRORS as error:
+        raise explained(error, where) from error
 
 
-def explained(reason: str, where: str) -> SsmailError:
-    """Return the error that says in one sentence what the database driver's `reason` means for the user."""
+def explained(error: Exception, where: str) -> SsmailError:
+    """Return the error that says in one sentence what one of DRIVER_ERRORS means for the user."""
+    reason = str(error.orig if isinstance(error, DBAPIError) else error)
+    if isinstance(error, UnicodeDecodeError):
+        reason = "malformed text"
     if "not a database" in reason or "malformed" in reason:
         return InputError(f"{where} is not an SQLite database, or is damaged ({reason}); give another file")
     if "unable to open" in reason or "readonly" in reason:

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import Connection, select
-from sqlalchemy.exc import DBAPIError
 
 from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
-from ssmail.store.connection import explained, revision_of
+from ssmail.store.connection import DRIVER_ERRORS, explained, revision_of
 from ssmail.store.maintenance.sqlite_file import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
@@ -51,12 +50,13 @@ def check(where: str | Path) -> list[Problem]:
     try:
         with opened(path) as engine, engine.connect() as connection:
             return list(_problems(path, connection, revision_of(connection, engine), folders))
-    except DBAPIError as error:
-        if "not a database" in str(error.orig):
-            raise InputError(f"{path} is not an SQLite database ({error.orig}); give another file") from error
-        if any(words in str(error.orig) for words in ("unable to open", "readonly", "locked")):
-            raise explained(str(error.orig), str(path)) from error
-        return [_damage(path, str(error.orig))]
+    except DRIVER_ERRORS as error:
+        reason = str(getattr(error, "orig", error))
+        if "not a database" in reason:
+            raise InputError(f"{path} is not an SQLite database ({reason}); give another file") from error
+        if any(words in reason for words in ("unable to open", "readonly", "locked")):
+            raise explained(error, str(path)) from error
+        return [_damage(path, reason)]
 
 
 def _problems(path: Path, connection: Connection, revision: str | None, folders: Sequence[Path]) -> Iterator[Problem]:
@@ -211,7 +211,7 @@ def _run_ids(path: Path) -> set[str]:
             if revision_of(connection, engine) is None:
                 return set()
             return set(connection.execute(select(schema.run.c.id)).scalars())
-    except (DBAPIError, InputError):
+    except (*DRIVER_ERRORS, InputError):
         return set()
 
 
