@@ -13,7 +13,7 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "referen
 
 # The source folder is the repository's root, so that links between README.md and docs/ hold on GitHub and on the site.
 root_doc = "README"
-include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "docs/**", "results/reference/*.md"]
+include_patterns = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "docs/**", "results/reference/*.md"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
 
 myst_heading_anchors = 3
@@ -66,6 +66,7 @@ docs/architecture
 docs/reference/api/index
 CONTRIBUTING
 CHANGELOG
+SECURITY
 ```
 """
 
