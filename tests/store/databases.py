@@ -62,6 +62,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 
 def change(path: Path | str, statement: str, *values: Any) -> None:
-    """Run a statement behind ssmail's back, foreign keys unwatched."""
+    """Run a statement behind ssmail's back, foreign keys and other constraints unwatched."""
     with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("PRAGMA ignore_check_constraints = ON")
         connection.execute(statement, values)

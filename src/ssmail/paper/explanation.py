@@ -59,15 +59,16 @@ def explain(path: Path) -> Explanation:
 
     Raises InputError for a file that is not a figure saved by ssmail, and for a CSV without its figure beside it.
     """
-    figure, csv = path, path.with_suffix(".csv")
+    figure = path
     if path.suffix.lower() == ".csv":
         beside = [path.with_suffix(ending) for ending in ENDINGS if path.with_suffix(ending).exists()]
         if not path.is_file():
             raise InputError(f"{path} cannot be read: there is no such file.")
         if not beside:
             raise InputError(f"{path} has no figure beside it that tells its runs; give the one that it belongs to.")
-        figure, csv = beside[0], path
+        figure = beside[0]
     source = provenance.read(figure)
+    csv = path if figure is not path else path.with_suffix(".csv")
     return Explanation(figure, source, csv, _csv_state(csv, source))
 
 
