@@ -139,7 +139,7 @@ def test_damaged_rows_are_noted_once(cli: CommandLine, filled: Path, tmp_path: P
         ("db", "export", "--compact", tmp_path / "x.db"),
     ):
         found = cli(*command, "--db", filled)
-        (remark,) = (line for line in found.err.splitlines() if "damaged" in line)
+        (remark,) = (line for line in found.err.splitlines() if "damaged row " in line)
         assert remark == f"1 damaged row left out; `ssmail db check --db {filled}` says what is wrong"
     damaged = next(str(row[0]) for row in contents(filled)["run"] if "paused" in row)
     assert f"run {damaged[:8]} is damaged: its state is 'paused'" in cli("db", "check", "--db", filled).out
