@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import ExitCode, InputError
+from ssmail.errors import ExitCode, InputError, stored_values
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, write_json
@@ -170,7 +170,8 @@ def export(
     if not runs:
         raise InputError(f"no finished or diverged run in {db} meets these conditions; `ssmail runs list` shows all.")
     needed = contents(store, runs)
-    done = export_compact(db, file, runs, needed.wanted)
+    with stored_values("these runs"):
+        done = export_compact(db, file, runs, needed.wanted)
     others = len(store.runs()) - len(runs)
     if as_json:
         write_json(

@@ -184,15 +184,16 @@ def delete(
     import sys
 
     store = options.open_store(db)
-    runs = store.runs(ids=ids)
-    names = ", ".join(f"{run.name} ({run.method}, seed {run.seed}, {run.state})" for run in runs)
+    full = store.full_ids(ids)
+    known = {run.id: f"{run.method}, seed {run.seed}, {run.state}" for run in store.runs()}
+    names = ", ".join(f"{run_id[:8]} ({known.get(run_id, 'damaged')})" for run_id in full)
     if not yes:
         if not sys.stdin.isatty():
             raise InputError(f"deleting needs a confirmation; give --yes to delete {names}.")
         if not confirm(f"Delete {names}?"):
             note("nothing deleted")
             raise typer.Exit(ExitCode.FAILURE)
-    store.delete([run.id for run in runs])
+    store.delete(full)
     note(f"deleted {names}")
 
 

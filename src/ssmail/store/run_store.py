@@ -84,6 +84,14 @@ class Store:
         self.damaged |= damaged
         return found if self._only is None else [row for row in found if row.id in self._only]
 
+    def full_ids(self, ids: Sequence[str]) -> list[str]:
+        """Return the full id for each id or prefix, also of a damaged row.
+
+        Raises InputError for one that is unknown or ambiguous.
+        """
+        with reading(self._engine) as connection:
+            return list(dict.fromkeys(queries.resolve(connection, ids)))
+
     def only(self, run_ids: Iterable[str]) -> Self:
         """Return the same store, except that its `runs` are among these (full ids); both use the same connections."""
         other = copy(self)

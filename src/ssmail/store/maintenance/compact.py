@@ -10,7 +10,7 @@ from typing import Any
 import numpy.typing as npt
 from sqlalchemy import Connection, Table, select, update
 
-from ssmail.errors import InputError, stored_values
+from ssmail.errors import InputError
 from ssmail.store import arrays, queries, schema
 from ssmail.store.connection import connect, reading, writing
 from ssmail.store.maintenance.run_rows import copy_rows
@@ -101,9 +101,7 @@ def _copy_run(there: Connection, here: Connection, run: RunRow, wanted: Wanted, 
             row = here.execute(select(array.c.dtype, array.c.shape, array.c.data).where(this)).one_or_none()
             if row is None:
                 raise InputError(f"run {run.name} has no sound array {shown(name)}")
-            with stored_values(f"run {run.name}"):
-                part = thin(arrays.decode(*row))
-            here.execute(update(array).where(this).values(**arrays.encode(part)))
+            here.execute(update(array).where(this).values(**arrays.encode(thin(arrays.decode(*row)))))
 
 
 def _counts(there: Connection, here: Connection, runs: Sequence[RunRow]) -> dict[str, int]:
