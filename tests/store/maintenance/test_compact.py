@@ -83,7 +83,7 @@ def test_an_export_overwrites_nothing_and_leaves_nothing_after_a_failure(store: 
     with pytest.raises(InputError, match="exists already and is not overwritten"):
         export_compact(store.where, target, store.runs(), NOTHING)
     wanted = Wanted((), {run_id: {"test/rollouts": lambda array: array[9]}})
-    with pytest.raises(InputError, match=r"does not fit together \(IndexError"):
+    with pytest.raises(IndexError):
         export_compact(store.where, tmp_path / "export" / "other.db", store.runs(), wanted)
     assert files(target.parent) == before
 
