@@ -7,10 +7,8 @@ structure, types and shapes are those of the run: torch itself checks too little
 import hashlib
 import io
 import math
-import os
 import pickle
 import pickletools
-import stat
 import zipfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -20,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.data.atomic_file import atomic_write
+from ssmail.data.foreign_files import IrregularFileError, open_regular, read_whole
 from ssmail.errors import InputError
 
 LARGEST_BYTES = 2**30
@@ -85,15 +84,14 @@ def load_checkpoint(path: Path, sha256: str | None = None) -> dict[str, Any]:
 
 def _read(path: Path) -> bytes:
     """Return the content of a regular file of bearable size; neither follow a link nor wait for a pipe."""
-    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
-    with os.fdopen(descriptor, "rb") as file:
-        found = os.fstat(descriptor)
-        if not stat.S_ISREG(found.st_mode):
-            raise InputError(f"the checkpoint {path} is no regular file; {AFRESH}")
-        content = file.read(LARGEST_BYTES + 1)
-    if len(content) > LARGEST_BYTES:
+    try:
+        with open_regular(path, follow=False) as file:
+            content = read_whole(file, LARGEST_BYTES)
+    except IrregularFileError:
+        raise InputError(f"the checkpoint {path} is no regular file; {AFRESH}") from None
+    if content is None:
         raise InputError(f"the checkpoint {path} is larger than 1 GiB; {AFRESH}")
-    return content
+    return bytes(content)
 
 
 def _check_archive(content: bytes) -> None:
