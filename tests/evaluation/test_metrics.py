@@ -1,3 +1,5 @@
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,7 +22,8 @@ def quick(predicted: np.ndarray) -> dict[str, float]:
 @pytest.mark.parametrize("lane", [0, 1])
 def test_either_lane_is_perfect(lane: int) -> None:
     values = quick(TRUTH.continuations[lane])
-    assert values == {"mode_mse": 0, "on_lane": 1, "lane_balance": 0, "lag": 0, "diverged": 0}
+    assert values.pop("path_rms") == pytest.approx(0.6 / np.sqrt(3), rel=0.15)  # of offsets drawn from [-0.6, 0.6]
+    assert values == {"mode_mse": 0, "on_lane": 1, "on_path": 1, "lane_balance": 0, "lag": 0, "diverged": 0}
 
 
 def test_the_lane_of_the_expert_is_not_demanded_but_one_lane_for_the_group_is() -> None:
@@ -70,6 +73,79 @@ def test_a_late_group_lags(delay: int) -> None:
     early = TRUTH.continuations[0].copy()
     early[:, :-delay] = early[:, delay:]
     assert quick(early)["lag"] > 0
+
+
+@pytest.mark.parametrize(("aside", "share"), [(0.35, 1.0), (0.5, 0.95), (1.7, 0.0)])
+def test_a_path_beside_the_road_is_seen_at_any_step(aside: float, share: float) -> None:
+    """Also where the end is right, which is all that on_lane looks at."""
+    wide = TRUTH.continuations[0].copy()
+    wide[:, 10:13, :, 1] += aside  # on the street, which has the direction of x
+    values = quick(wide)
+    assert values["on_lane"] == 1
+    assert values["on_path"] == pytest.approx(share, abs=0.1 if 0 < share < 1 else 0)
+
+
+def test_path_rms_by_hand() -> None:
+    lines = np.array([[[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], [[0.0, 5.0], [1.0, 5.0], [2.0, 5.0]]])
+    path = np.array([[0.0, 0.0], [1.0, 2.0], [9.0, 0.0]])[None, :, None]  # the last is beyond the end of the line
+    assert metrics.path_metrics(path, lines) == {"on_path": 0.0, "path_rms": pytest.approx(np.sqrt(4 / 3))}
+    assert metrics.path_metrics(path * [1, 0.5], lines)["on_path"] == 1.0
+    path[0, 1] = np.nan
+    assert metrics.path_metrics(path, lines) == {"on_path": 0.0, "path_rms": np.inf}
+
+
+@given(st.lists(st.tuples(st.integers(-3, 3), st.integers(-3, 3)), min_size=3, max_size=8), st.integers(0, 99))
+def test_distances_need_the_corners_alone(points: list[tuple[int, int]], seed: int) -> None:
+    line = np.unique(np.array(points, dtype=float), axis=0)
+    if len(line) < 2:
+        return
+    fine = np.concatenate([np.linspace(a, b, 5)[:-1] for a, b in pairwise(line)] + [line[-1:]])
+    somewhere = np.random.default_rng(seed).uniform(-4, 4, (20, 2))
+    assert len(metrics.corners(fine)) <= len(line)
+    for extended in (False, True):
+        expected = metrics.polyline_distances(somewhere, fine, extended)
+        assert metrics.polyline_distances(somewhere, metrics.corners(fine), extended) == pytest.approx(expected)
+
+
+def test_the_expert_turns_where_the_road_does() -> None:
+    many = generate(PARAMS.model_copy(update={"test": 1000})).test
+    values = metrics.turning(many.positions, many.continuations)
+    assert values["turn_own"] == pytest.approx(-1, abs=0.06)  # the speed is within 5 % of 1
+    assert values["turn_others"] == pytest.approx(0, abs=0.06)
+    assert values["turn_group"] == pytest.approx(-1, abs=0.06)
+    assert values["turn_lead"] == 0
+
+
+def test_turning_by_the_clock_and_after_the_leader_is_told_from_turning_where_the_road_does() -> None:
+    draw = np.random.default_rng(0)
+    ahead, one = draw.integers(0, 4, size=40), TRUTH.continuations[0, 0]
+    speed = one[1, 0, 0] - one[0, 0, 0]
+    by_place = np.stack([one[steps : steps + 40] for steps in ahead])  # start ahead, and turn as much earlier
+    aside = draw.normal(size=(40, 1, PARAMS.agents))
+    aside[..., 0] = 0
+    after_leader = by_place.copy()
+    after_leader[..., 0] += aside  # followers start elsewhere, and turn when the leader does
+    by_clock = np.stack([one[:40]] * 40)
+    by_clock[..., 0] += draw.normal(size=(40, 1, PARAMS.agents))
+    modes = np.stack([by_place, -by_place])
+    leader, clock = (metrics.turning(positions, modes) for positions in (after_leader, by_clock))
+    assert [leader[f"turn_{who}"] for who in ("own", "others", "group")] == pytest.approx(
+        [-1 / 3 / speed, -1 / 3 / speed, -1 / speed]
+    )
+    assert [clock[f"turn_{who}"] for who in ("own", "others", "group")] == pytest.approx([0, 0, 0])
+
+
+def test_an_early_group_leads() -> None:
+    early = TRUTH.positions.copy()
+    early[:, 1:-2] = TRUTH.positions[:, 3:]
+    assert metrics.turning(early, TRUTH.continuations)["turn_lead"] == pytest.approx(2, abs=0.01)
+
+
+def test_who_never_turns_has_no_turn() -> None:
+    straight = TRUTH.positions.copy()
+    straight[..., 1] = straight[:, :1, :, 1]
+    assert np.isnan(metrics.turn_steps(straight)).all()
+    assert all(np.isnan(value) for value in metrics.turning(straight, TRUTH.continuations).values())
 
 
 def test_diverged() -> None:

@@ -10,6 +10,10 @@ from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Integers, Trajectories
 
 ON_LANE_TOLERANCE = 0.15  # of the final lane separation
+ON_PATH_TOLERANCE = 1.0  # step lengths; the expert stays within 0.6
+TURNED = (
+    1.5  # step lengths sideways of its start, at which an agent has turned; where it turns is in ssmail.data.yjunction
+)
 DIVERGED = 10.0  # |scaled position|
 FORECAST_STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
 
@@ -21,14 +25,15 @@ def lane_metrics(predicted: Floats, continuations: Floats, centre_lines: Floats,
     """Y-Junction: the metrics of every epoch.
 
     predicted (B, T, N, P) holds one rollout per start, and continuations (L, B, T, N, P) the expert from that start
-    into each mode; both include the start. mode_mse and lag are in scaled units; on_lane, lane_balance and diverged are
-    shares.
+    into each mode; both include the start. mode_mse and lag are in scaled units, path_rms in step lengths; on_lane,
+    on_path, lane_balance and diverged are shares.
     """
     rollout, modes = predicted[:, 1:], continuations[:, :, 1:]
     scaled, scaled_modes = scaling.scale_positions(rollout), scaling.scale_positions(modes)
     return {
         "mode_mse": mode_mse(scaled, scaled_modes),
         "on_lane": on_lane(rollout, modes, centre_lines),
+        **path_metrics(rollout, centre_lines),
         "lane_balance": lane_balance(rollout, modes),
         "lag": lag(scaled, scaled_modes),
         "diverged": diverged(scaled),
@@ -38,12 +43,13 @@ def lane_metrics(predicted: Floats, continuations: Floats, centre_lines: Floats,
 def lane_test_metrics(samples: Floats, truth: Trajectories, centre_lines: Floats, scaling: Scaling) -> dict[str, float]:
     """Y-Junction: the metrics of the final evaluation, from samples (S, B, T, N, P) that include the start.
 
-    All S rollouts of all starts enter `lane_metrics`, and ade and fde (raw units). min_ade_20 and min_fde_20 take the
-    best of the S samples of each start.
+    All S rollouts of all starts enter `lane_metrics`, `turning`, and ade and fde (raw units). min_ade_20 and min_fde_20
+    take the best of the S samples of each start.
     """
     s, b = samples.shape[:2]
     continuations = np.tile(truth.continuations, (1, s, 1, 1, 1))
-    values = lane_metrics(samples.reshape(s * b, *samples.shape[2:]), continuations, centre_lines, scaling)
+    rollouts = samples.reshape(s * b, *samples.shape[2:])
+    values = lane_metrics(rollouts, continuations, centre_lines, scaling) | turning(rollouts, continuations)
     ade, fde = displacement_errors(samples[:, :, 1:], truth.positions[:, 1:])
     return values | {
         "ade": float(ade.mean()),
@@ -140,6 +146,62 @@ def on_lane(predicted: Floats, continuations: Floats, centre_lines: Floats) -> f
     return float(np.mean(distance <= ON_LANE_TOLERANCE * separation))
 
 
+@np.errstate(over="ignore", invalid="ignore")
+def path_metrics(predicted: Floats, centre_lines: Floats) -> dict[str, float]:
+    """Return how far agents go sideways of the lanes on their whole path, from positions (B, T, N, 2) in step lengths.
+
+    Each agent is compared with the centre line that its path is nearest to, in the mean square. on_path: share of
+    agents that stay within ON_PATH_TOLERANCE of it at every step. path_rms: root mean square distance from it, inf if a
+    position is not finite. Neither sees tempo: an agent that stands still on the street is on its path.
+    """
+    distances = np.stack([polyline_distances(predicted, corners(line), extended=True) for line in centre_lines])
+    distances = np.nan_to_num(distances, nan=np.inf)  # (L, B, T, N)
+    lane = np.square(distances).mean(axis=2, keepdims=True).argmin(axis=0, keepdims=True)
+    own = np.take_along_axis(distances, lane, axis=0)[0]
+    within = own.max(axis=1) <= ON_PATH_TOLERANCE
+    return {"on_path": float(within.mean()), "path_rms": float(np.sqrt(np.square(own).mean()))}
+
+
+def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
+    """Return when agents turn into a lane, from positions (B, T, N, 2) in step lengths that include the start.
+
+    An agent turns at the step (interpolated) at which it is TURNED sideways of its start. Least squares over the B
+    trajectories give the change of that step per step length by which agents start further ahead: turn_own by which the
+    agent itself does, turn_others any one of the others, turn_group the whole group; each is a mean over agents. The
+    expert of the Y-Junction has -1 / speed, 0 and -1 / speed: agents turn where the road does. A group that turns by
+    the clock has 0, 0, 0, and one in which followers copy the leader has a small turn_own. turn_lead is how many steps
+    before the expert, in the mode nearest to the trajectory, an agent turns on average. Trajectories in which an agent
+    does not turn are left out; NaN where fewer than two for each agent remain.
+    """
+    modes = nearest_mode(predicted, continuations)
+    target = continuations[modes, np.arange(len(modes))]
+    when, expert = turn_steps(predicted), turn_steps(target)  # (B, N)
+    known = np.isfinite(when).all(axis=1) & np.isfinite(expert).all(axis=1)
+    agents = when.shape[1]
+    if known.sum() < 2 * (agents + 1):
+        return dict.fromkeys(("turn_own", "turn_others", "turn_group", "turn_lead"), float("nan"))
+    starts = predicted[known, 0, :, 0]  # along the street, (B', N)
+    design = np.concatenate([starts - starts.mean(axis=0), np.ones((len(starts), 1))], axis=1)
+    slopes = np.linalg.lstsq(design, when[known], rcond=None)[0][:agents]  # (start of, turn of)
+    own, group = np.diag(slopes), slopes.sum(axis=0)
+    return {
+        "turn_own": float(own.mean()),
+        "turn_others": float((group - own).mean() / max(agents - 1, 1)),
+        "turn_group": float(group.mean()),
+        "turn_lead": float((expert - when)[known].mean()),
+    }
+
+
+@np.errstate(invalid="ignore", divide="ignore")
+def turn_steps(positions: Floats) -> Floats:
+    """Return the step (B, N), interpolated, at which each agent of (B, T, N, 2) is TURNED; NaN if it never is."""
+    aside = np.abs(positions[..., 1] - positions[:, :1, :, 1])  # (B, T, N)
+    step = (aside >= TURNED).argmax(axis=1)  # 0 if never: no agent is aside at its start
+    before, after = (np.take_along_axis(aside, at[:, None], axis=1)[:, 0] for at in (np.maximum(step - 1, 0), step))
+    steps: Floats = np.where(step > 0, step - 1 + (TURNED - before) / (after - before), np.nan)
+    return steps
+
+
 def lag(predicted: Floats, continuations: Floats) -> float:
     """Mean signed error along the direction of travel of the nearest mode; negative means behind the expert."""
     mode = nearest_mode(predicted, continuations)
@@ -178,6 +240,16 @@ def stroke_distances(drawn: Floats, letters: Floats) -> Floats:
         for b, path in enumerate(paths[n]):
             found[n, b] = np.maximum(beside[b], polyline_distances(letter, path).mean())
     return found.T
+
+
+def corners(line: Floats) -> Floats:
+    """Return the points (C, 2) of a polyline (P', 2) at which it bends, and its ends."""
+    steps = np.diff(line, axis=0)
+    cross = steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0]
+    length = np.linalg.norm(steps, axis=1)
+    bends = np.abs(cross) > 1e-9 * length[:-1] * length[1:]
+    kept: Floats = line[np.concatenate([[True], bends, [True]])]
+    return kept
 
 
 def polyline_distances(points: Floats, line: Floats, extended: bool = False) -> Floats:
