@@ -3,16 +3,11 @@
 import matplotlib.font_manager  # noqa: F401 (the first import makes folders in the user's home)
 import pytest
 
+from tests.cli.conftest import _no_settings
 from tests.hostile import harness
 
-SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
+__all__ = ["_no_settings"]
 _cases = pytest.StashKey[int]()
-
-
-@pytest.fixture(autouse=True)
-def _no_settings(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in SETTINGS:
-        monkeypatch.delenv(name, raising=False)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -12,14 +12,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.config.experiments import build_spec
 from ssmail.errors import InputError
-from ssmail.store import RunState, Store
+from ssmail.store import Store
 from ssmail.store.checkpoint_files import fault_of, run_folder
 from ssmail.store.maintenance.checks import check
 from ssmail.store.maintenance.merge import merge
 from ssmail.store.schema import is_run_id
 from tests.hostile.harness import cases, hold, refused
+from tests.store.databases import add
+from tests.store.databases import change as change_file
 
 BAD_IDS = [
     "../../precious",
@@ -37,29 +38,18 @@ BAD_IDS = [
 ]
 
 
-def stored(folder: Path, seeds: int = 1, state: RunState = RunState.FINISHED) -> list[str]:
+def stored(folder: Path, seeds: int = 1) -> list[str]:
     """A database with runs that have checkpoints, in `folder`; return their ids."""
     store = Store.open(folder / "ssmail.db")
-    ids = []
-    for seed in range(seeds):
-        spec = build_spec("ssail", "yjunction", "smoke")
-        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu", repeat=True)
-        writer.epoch(1, {"train/mode_mse": 0.1})
-        writer.folder.mkdir(parents=True)
-        for name in ("best.pt", "last.pt"):
-            (writer.folder / name).write_bytes(name.encode())
-            writer.artifact(name)
-        writer.final(1, {"test/mode_mse": 0.1})
-        writer.finish(state)
-        ids.append(writer.run_id)
+    ids = [
+        add(store, seed, checkpoints={name: name.encode() for name in ("best.pt", "last.pt")}) for seed in range(seeds)
+    ]
     store.close()
     return ids
 
 
 def change(folder: Path, statement: str, *values: object) -> None:
-    with closing(sqlite3.connect(folder / "ssmail.db")) as connection, connection:
-        connection.execute("PRAGMA ignore_check_constraints = ON")
-        connection.execute(statement, values)
+    change_file(folder / "ssmail.db", statement, *values)
 
 
 def renamed(folder: Path, run_id: str, new: object) -> None:

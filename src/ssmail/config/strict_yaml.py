@@ -5,15 +5,14 @@ of JSON, so a key is text, and there are no tags. Anchors, aliases and merge key
 like the size and the depth of every text.
 """
 
-import os
 import re
-import stat
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
 from yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode
 
+from ssmail.config.foreign_files import IrregularFileError, open_regular, read_whole
 from ssmail.errors import InputError
 
 MOST_BYTES = 200_000  # of a text; experiments.yaml has 8,000
@@ -48,17 +47,18 @@ def read_bytes(path: Path, most: int) -> bytes:
     A named pipe or a device is not waited for.
     """
     try:
-        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise InputError(f"{path} is not a file; give the path of one.")
-            content = file.read(most + 1)
+        with open_regular(path) as file:
+            content = read_whole(file, most)
+    except IrregularFileError:
+        what = "cannot be read: Is a directory" if path.is_dir() else "is not a file; give the path of one"
+        raise InputError(f"{path} {what}.") from None
     except OSError as error:
+        if error.strerror is None:  # a null byte in the path
+            raise InputError(f"{str(path)!r} is not a path; give that of a file.") from None
         raise InputError(f"{path} cannot be read: {error.strerror}.") from None
-    except ValueError:  # a null byte in the path
-        raise InputError(f"{str(path)!r} is not a path; give that of a file.") from None
-    if len(content) > most:
+    if content is None:
         raise InputError(f"{path} has more than {most:,} bytes; give a smaller file.")
-    return content
+    return bytes(content)
 
 
 def parse(text: str) -> Any:

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ssmail.config.foreign_files import ARCHIVE_ERRORS, is_plain, open_regular, read_whole
 from ssmail.config.sections import DataSpec, LettersSpec, YJunctionSpec
 from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
-from ssmail.data.foreign_files import ARCHIVE_ERRORS, is_plain, open_regular, read_whole
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.mocap.acclaim_lines import is_name
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
@@ -108,7 +108,6 @@ def load(path: Path, environment: str | None = None) -> ExpertSet:
     that names the file and the fault, also if the set belongs to another `environment` than given.
     """
     command = COMMANDS.get(environment or "yjunction", COMMANDS["yjunction"])
-    damaged = InputError(f"{path} is truncated or not an .npz file; make it again with `{command} --force`")
     try:
         with open_regular(path) as contents:
             if contents.peek(len(MAGIC)).startswith(MAGIC):
@@ -123,7 +122,7 @@ def load(path: Path, environment: str | None = None) -> ExpertSet:
     except MemoryError:
         raise _fault(f"{path} does not fit into memory", command) from None
     except ARCHIVE_ERRORS:
-        raise damaged from None
+        raise _fault(f"{path} is truncated or not an .npz file", command) from None
 
 
 def _load(file: "_File", environment: str | None) -> ExpertSet:

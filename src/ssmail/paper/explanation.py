@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from ssmail.data.foreign_files import open_regular, read_whole
+from ssmail.config.foreign_files import open_regular, read_whole
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES

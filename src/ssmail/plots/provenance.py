@@ -22,7 +22,7 @@ from PIL import Image
 from pydantic import TypeAdapter
 
 from ssmail import __version__
-from ssmail.data.foreign_files import open_regular, read_whole
+from ssmail.config.foreign_files import open_regular, read_whole
 from ssmail.errors import InputError
 from ssmail.store import RunRow
 from ssmail.store.comparison import spec_differences

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from ssmail.data.foreign_files import IrregularFileError, open_regular
+from ssmail.config.foreign_files import IrregularFileError, open_regular
 from ssmail.errors import InputError
 from ssmail.store.queries import ArtifactRow
 from ssmail.store.schema import is_run_id
@@ -27,7 +27,7 @@ def checkpoint_root_of(database: Path) -> Path:
 
 
 def run_folder(root: Path, run_id: str) -> Path:
-    """Return the folder of a run's checkpoints. Every path that is made of an id is made here.
+    """Return the folder of a run's checkpoints. Every folder that is written, copied or deleted by id comes from here.
 
     Raises InputError for an id that is not 32 hexadecimal digits, and for a folder that is a link: what lies behind it
     may be anything.
@@ -40,9 +40,9 @@ def run_folder(root: Path, run_id: str) -> Path:
     return folder
 
 
-def remove_folder(folder: Path) -> None:
-    """Delete a folder of checkpoints; links in it are deleted, not followed."""
-    shutil.rmtree(folder, ignore_errors=True)
+def remove_run_folder(root: Path, run_id: str) -> None:
+    """Delete the folder of a run's checkpoints; links in it are deleted, not followed. Raises as `run_folder` does."""
+    shutil.rmtree(run_folder(root, run_id), ignore_errors=True)
 
 
 def fault_of(row: ArtifactRow) -> str | None:
@@ -117,14 +117,14 @@ class CheckpointCopies:
         """Remove the folders placed since the last `commit` and restore those that they replaced."""
         while self._placed:
             run_id = self._placed.pop()
-            remove_folder(run_folder(self.target, run_id))
+            remove_run_folder(self.target, run_id)
             if self._replaced(run_id).exists():
                 self._replaced(run_id).rename(self.target / run_id)
 
     def remove(self, run_ids: Iterable[str]) -> None:
         """Delete the folders of runs that are no longer in the target database."""
         for run_id in run_ids:
-            remove_folder(run_folder(self.target, run_id))
+            remove_run_folder(self.target, run_id)
 
     def close(self) -> None:
         """Delete the staging folder, and the checkpoint root if it was created for nothing."""

@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, select, table, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from ssmail.data.foreign_files import open_regular
+from ssmail.config.foreign_files import open_regular
 from ssmail.errors import InputError, SsmailError, masked, shortened
 from ssmail.store.schema import REVISIONS, metadata
 

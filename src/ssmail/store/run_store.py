@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, shortened
 from ssmail.store import arrays, queries, run_metadata, schema
-from ssmail.store.checkpoint_files import checkpoint_root_of, remove_folder, run_folder
+from ssmail.store.checkpoint_files import checkpoint_root_of, remove_run_folder
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.schema import RunState
@@ -226,7 +226,7 @@ class Store:
                 self.require_idle(row)
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
         for run_id in filter(schema.is_run_id, full):
-            remove_folder(run_folder(self.checkpoint_root, run_id))
+            remove_run_folder(self.checkpoint_root, run_id)
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 

@@ -17,8 +17,8 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, nn
 
+from ssmail.config.foreign_files import IrregularFileError, open_regular, read_whole
 from ssmail.data.atomic_file import atomic_write
-from ssmail.data.foreign_files import IrregularFileError, open_regular, read_whole
 from ssmail.errors import InputError
 
 LARGEST_BYTES = 2**30

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from ssmail.data.foreign_files import ARCHIVE_ERRORS, IrregularFileError, is_plain, open_regular, read_whole
+from ssmail.config.foreign_files import ARCHIVE_ERRORS, IrregularFileError, is_plain, open_regular, read_whole
 from ssmail.errors import InputError
 
 LARGEST = {".asf": 2**20, ".amc": 32 * 2**20}  # bytes; the files of subject 35 have 7 kB and 0.5 MB

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ssmail.data import foreign_files
-from ssmail.data.foreign_files import IrregularFileError, is_plain, open_regular, read_whole
+from ssmail.config import foreign_files
+from ssmail.config.foreign_files import IrregularFileError, is_plain, open_regular, read_whole
 from tests.hostile.harness import time_limit
 
 
