@@ -111,9 +111,9 @@ def merge(
 ) -> None:
     """Add the runs of another database to this one.
 
-    Copies their checkpoints too; adds all runs or none. Of two runs with the same spec, seed and data, keeps the one
-    that got further; of two that ended, keeps the one already there and reports differences. Runs that are being
-    computed, and runs with damaged rows, are left out.
+    Copies their checkpoints too. Of two runs with the same spec, seed and data, keeps the one that got further; of two
+    that ended, keeps the one already there and reports differences. Runs that are being computed, and runs with damaged
+    rows, are left out. A merge that fails or is killed changes nothing.
     """
     from ssmail.store.maintenance.merge import merge as merge_databases
 

@@ -219,9 +219,9 @@ class OutputError(SsmailError):
 
 
 class _Stream(io.RawIOBase):
-    """A standard stream below its buffer. What stderr (`strict` off) cannot write is dropped: training must go on.
+    """The raw layer of stdout or stderr. Output that stderr cannot write is dropped, so that training goes on.
 
-    On stdout (`strict`) it is an OutputError, except when the reader of a pipe has left: BrokenPipeError.
+    On stdout (`strict`) a failed write raises OutputError, or BrokenPipeError when the reader of a pipe has left.
     """
 
     def __init__(self, raw: Any, strict: bool) -> None:

@@ -68,10 +68,10 @@ def stored_values(subject: str) -> Iterator[None]:
 
 
 def printable(text: object) -> str:
-    """Return the text with escapes, such as \\x1b or \\u202e, for all characters that a terminal does not just show.
+    """Return the text with escapes, such as \\x1b or \\u202e, for characters that a terminal would not simply display.
 
-    These are control characters (a newline is one), controls of the direction of writing, lone surrogates, and all that
-    is invisible or a space other than " ". So the text is one line, and looks like what it is.
+    These are control characters (including newlines), bidirectional controls, lone surrogates, invisible characters,
+    and all spaces but " ". The result is one line, and nothing in it is hidden or reordered.
     """
     words = str(text)
     if words.isprintable() and not _INVISIBLE.search(words):
@@ -113,7 +113,7 @@ def sentence(text: str) -> str:
 def command_line(*words: object) -> str:
     """Return a command to suggest, with its words quoted for a POSIX shell and without passwords.
 
-    A word that is not printable, has a backtick or is very long is not shown: three dots take its place.
+    A word that is not printable, contains a backtick or is very long is replaced by three dots.
     """
     return shlex.join(map(_word, words))
 

@@ -165,13 +165,13 @@ def path_metrics(predicted: Floats, centre_lines: Floats) -> dict[str, float]:
 def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
     """Return when agents turn into a lane, from positions (B, T, N, 2) in step lengths that include the start.
 
-    An agent turns at the step (interpolated) at which it is TURNED sideways of its start. Least squares over the B
-    trajectories give the change of that step per step length by which agents start further ahead: turn_own by which the
-    agent itself does, turn_others any one of the others, turn_group the whole group; each is a mean over agents. The
-    expert of the Y-Junction has -1 / speed, 0 and -1 / speed: agents turn where the road does. A group that turns by
-    the clock has 0, 0, 0, and one in which followers copy the leader has a small turn_own. turn_lead is how many steps
-    before the expert, in the mode nearest to the trajectory, an agent turns on average. Trajectories in which an agent
-    does not turn are left out; NaN where fewer than two for each agent remain.
+    An agent turns at the (interpolated) step at which it is TURNED sideways of its start. A least-squares fit over the
+    B trajectories gives how much later it turns when an agent starts one step length further ahead: the agent itself
+    (turn_own), one of the others (turn_others), or all of them (turn_group); each is a mean over agents. The expert of
+    the Y-Junction has -1 / speed, 0 and -1 / speed, because its agents turn where the road does. A group that turns by
+    the clock has 0, 0 and 0; if the followers copy the leader, turn_own is small. turn_lead is the mean number of steps
+    by which agents turn before the expert, in the mode nearest to the trajectory. Trajectories in which an agent does
+    not turn are left out. All values are NaN if fewer than 2 (N + 1) trajectories remain.
     """
     modes = nearest_mode(predicted, continuations)
     target = continuations[modes, np.arange(len(modes))]
