@@ -196,7 +196,13 @@ class SacSpec(Frozen):
     target_entropy: Finite  # nats per action dimension of one agent, for actions in scaled units
     # consecutive steps of a trajectory that the encoder's gradient covers in an update (truncated BPTT); null: all
     encoder_steps: Count | None
+    # steps over which the actor's objective follows the policy through the known dynamics and rewards before the
+    # critics estimate the rest (model-based value expansion); 0: the critics estimate all, as in the paper
+    expansion_steps: Annotated[int, Field(ge=0, le=100)]
     graph_entropy: NonNegative  # weight of the edge types' entropy in the actor's objective
+    # the policy that is evaluated has weights averaged over the updates, of which each counts this fraction (an
+    # exponential moving average); null: the current weights
+    average: Annotated[float, Field(gt=0, lt=1)] | None
 
 
 class VariationalSpec(Frozen):

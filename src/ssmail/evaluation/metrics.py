@@ -257,10 +257,13 @@ def polyline_distances(points: Floats, line: Floats, extended: bool = False) -> 
 
     With `extended` the last segment continues as a ray.
     """
-    begin, step = line[:-1], np.diff(line, axis=0)
-    limit = np.append(np.ones(len(step) - 1), np.inf if extended else 1.0)
-    offset = points[..., None, :] - begin  # (..., segments, 2)
-    along = (offset * step).sum(-1) / np.maximum(np.square(step).sum(-1), np.finfo(np.float64).tiny)
-    nearest = offset - np.clip(along, 0.0, limit)[..., None] * step
-    distances: Floats = np.sqrt(np.square(nearest).sum(-1).min(axis=-1))
-    return distances
+    steps = np.diff(line, axis=0)
+    x, y = points[..., 0], points[..., 1]
+    squares: Floats = np.full(x.shape, np.inf)
+    for index, ((begin_x, begin_y), (dx, dy)) in enumerate(zip(line[:-1], steps, strict=True)):
+        offset_x, offset_y = x - begin_x, y - begin_y
+        along = (offset_x * dx + offset_y * dy) / max(dx * dx + dy * dy, np.finfo(np.float64).tiny)
+        limit = np.inf if extended and index == len(steps) - 1 else 1.0
+        along = np.clip(along, 0.0, limit)
+        squares = np.minimum(squares, (offset_x - along * dx) ** 2 + (offset_y - along * dy) ** 2)
+    return np.sqrt(squares)

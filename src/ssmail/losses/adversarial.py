@@ -1,7 +1,7 @@
 """Discriminator losses and rewards of ssail, gail and wail.
 
 Everywhere 0 = generated and 1 = expert: a higher output D means "more like the expert" and is a higher reward. Outputs
-are (B, T, N); the losses are scalars to minimize.
+are (B, T, N); the losses are scalars to minimize. With an axis of S seeds in front, there is one loss per seed, (S,).
 """
 
 from collections.abc import Callable
@@ -9,19 +9,19 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from ssmail.losses import Terms
+from ssmail.losses import PER_SEED, Terms
 
 
 def ssail_loss(generated: Tensor, expert: Tensor, mixed: Tensor, labels: Tensor) -> tuple[Tensor, Terms]:
     """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (label(alpha) - D(tau_alpha))^2, each averaged over B, T and N.
 
-    labels: (B,) targets for the mixed trajectories: alpha itself in the paper, or that of A.2 (`ssmail.losses.labels`).
+    labels: (B,), or (S, B), targets for the mixed trajectories: alpha itself in the paper, or that of A.2 (`ssmail.losses.labels`).
     """
-    target = labels.view(-1, *[1] * (mixed.dim() - 1))
+    target = labels.view(*labels.shape, *[1] * (mixed.dim() - labels.dim()))
     terms = {
-        "generated": generated.square().mean(),
-        "expert": (1 - expert).square().mean(),
-        "self_supervised": (target - mixed).square().mean(),
+        "generated": generated.square().mean(dim=PER_SEED),
+        "expert": (1 - expert).square().mean(dim=PER_SEED),
+        "self_supervised": (target - mixed).square().mean(dim=PER_SEED),
     }
     return terms["generated"] + terms["expert"] + terms["self_supervised"], terms
 
@@ -37,8 +37,8 @@ def gail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:
     Where generated and expert data have densities p_G and p_E, the optimal logit is log(p_E / p_G).
     """
     terms = {
-        "generated": nn.functional.softplus(generated).mean(),
-        "expert": nn.functional.softplus(-expert).mean(),
+        "generated": nn.functional.softplus(generated).mean(dim=PER_SEED),
+        "expert": nn.functional.softplus(-expert).mean(dim=PER_SEED),
     }
     return terms["generated"] + terms["expert"], terms
 
@@ -54,7 +54,7 @@ def gail_reward(logit: Tensor) -> Tensor:
 
 def wail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:
     """mean D(tau_G) - mean D(tau_E): minus the critic's estimate of the Wasserstein distance (Eq. 2)."""
-    terms = {"generated": generated.mean(), "expert": -expert.mean()}
+    terms = {"generated": generated.mean(dim=PER_SEED), "expert": -expert.mean(dim=PER_SEED)}
     return terms["generated"] + terms["expert"], terms
 
 
@@ -79,4 +79,4 @@ def gradient_penalty(
     inputs = [torch.lerp(g, e, weight).requires_grad_() for g, e in zip(generated, expert, strict=True)]
     gradients = torch.autograd.grad(critic(*inputs).sum(), inputs, create_graph=True)
     norm = torch.cat(gradients, dim=-1).square().sum(dim=-1).add(1e-12).sqrt()  # (B, T, N); differentiable at 0
-    return (norm - 1).square().mean()
+    return (norm - 1).square().mean(dim=PER_SEED)

@@ -29,8 +29,8 @@ def sample_alpha(batch: int, pieces: Sequence[tuple[float, float, float]], gener
 
 
 def mix(generated: Tensor, expert: Tensor, alpha: Tensor) -> Tensor:
-    """Return (1 - alpha) * generated + alpha * expert, for tensors (B, ...) and alpha (B,)."""
-    a = alpha.view(-1, *[1] * (generated.dim() - 1))
+    """Return (1 - alpha) * generated + alpha * expert, for tensors (B, ...) and alpha (B,), or (S, B, ...) and (S, B)."""
+    a = alpha.view(*alpha.shape, *[1] * (generated.dim() - alpha.dim()))
     return generated + a * (expert - generated)
 
 

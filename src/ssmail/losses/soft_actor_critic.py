@@ -1,27 +1,31 @@
 """Soft actor-critic (Haarnoja et al. 2018) for N agents that each have a return of their own.
 
-Tensors are (B, T, N) and Q-values of the twin critics (B, T, N, 2). Implementations of SAC differ silently in some
+Tensors are (B, T, N) and Q-values of the twin critics (B, T, N, 2), with an axis of S seeds in front or without; losses
+are scalars, or (S,). Temperatures are scalars or broadcast to the tensors. Implementations of SAC differ silently in some
 choices. In ssmail the target entropy is given per action dimension (spec: sac.target_entropy), the temperature loss is
 on the log temperature, and no state is terminal, because episodes end by truncation only.
 """
 
+import torch
 from torch import Tensor
+
+from ssmail.losses import PER_SEED
 
 
 def critic_target(reward: Tensor, next_q: Tensor, next_log_prob: Tensor, temperature: Tensor, gamma: float) -> Tensor:
     """r + gamma * (min_k Q_k(s', a') - temperature * log pi(a' | s')), without a gradient."""
-    soft_value = next_q.min(dim=-1).values - temperature * next_log_prob
+    soft_value = torch.minimum(*next_q.unbind(dim=-1)) - temperature * next_log_prob
     return (reward + gamma * soft_value).detach()
 
 
 def critic_loss(q: Tensor, target: Tensor) -> Tensor:
     """Mean squared error of each critic, summed over the two."""
-    return (q - target.unsqueeze(-1)).square().mean(dim=(0, 1, 2)).sum()
+    return (q - target.unsqueeze(-1)).square().sum(dim=-1).mean(dim=PER_SEED)
 
 
 def actor_loss(q: Tensor, log_prob: Tensor, temperature: Tensor) -> Tensor:
     """Mean of temperature * log pi(a | s) - min_k Q_k(s, a)."""
-    return (temperature.detach() * log_prob - q.min(dim=-1).values).mean()
+    return (temperature.detach() * log_prob - torch.minimum(*q.unbind(dim=-1))).mean(dim=PER_SEED)
 
 
 def temperature_loss(log_temperature: Tensor, log_prob: Tensor, target_entropy: float) -> Tensor:
@@ -29,4 +33,4 @@ def temperature_loss(log_temperature: Tensor, log_prob: Tensor, target_entropy: 
 
     It raises the temperature while the entropy is below its target.
     """
-    return -(log_temperature * (log_prob.detach() + target_entropy)).mean()
+    return -(log_temperature * (log_prob.detach() + target_entropy)).mean(dim=PER_SEED)

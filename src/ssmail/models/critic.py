@@ -10,7 +10,7 @@ from ssmail.models.message_passing import TypedMessages
 
 
 class TwinLinear(nn.Module):
-    """Two independent linear layers in one operation: (..., 2, D) -> (..., 2, H)."""
+    """Two independent linear layers in one operation: (2, M, D) -> (2, M, H), or with an axis of S seeds in front."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -19,8 +19,9 @@ class TwinLinear(nn.Module):
         self.bias = nn.Parameter(torch.empty(2, outputs).uniform_(-bound, bound))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply layer k to x[..., k, :]."""
-        return torch.einsum("...kd,kdh->...kh", x, self.weight) + self.bias
+        """Apply layer k to x[..., k, :, :]."""
+        weight, bias = self.weight.flatten(0, -3), self.bias.flatten(0, -2).unsqueeze(1)
+        return torch.baddbmm(bias, x.flatten(0, -3), weight).view(*x.shape[:-1], -1)
 
 
 class TwinCritic(nn.Module):
@@ -39,12 +40,16 @@ class TwinCritic(nn.Module):
         self.last = TwinLinear(hidden, 1)
 
     def forward(self, x: Tensor, action: Tensor, graph: Tensor) -> Tensor:
-        """Map x (..., N, D), action (..., N, A) and graph (..., N, N, K) to (..., N, 2)."""
+        """Map x (..., N, D), action (..., N, A) and graph (..., N, N, K) to (..., N, 2).
+
+        With the weights of S seeds, the first axis of all inputs is S.
+        """
         inputs = torch.cat([x, action], dim=-1)
         messages = [m(inputs, graph) for m in self.messages]
-        # (..., N, 2, H + D + A): both critics side by side
-        h = torch.stack([torch.cat([m, inputs], dim=-1) if self.own_input else m for m in messages], dim=-2)
+        each = [torch.cat([m, inputs], dim=-1) if self.own_input else m for m in messages]
+        seeds = self.first.weight.dim() - 3  # the number of axes in front, 0 or 1
+        h = torch.stack([part.flatten(seeds, -2) for part in each], dim=seeds)  # (2, M, H + D + A)
         h = torch.relu(self.first(h))
         h = torch.relu(self.second(h))
-        q: Tensor = self.last(h).squeeze(-1)
-        return q
+        q: Tensor = self.last(h).squeeze(-1).movedim(seeds, -1)  # (M, 2)
+        return q.unflatten(-2, x.shape[seeds:-1])

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.linear import Linear
 from ssmail.models.message_passing import EdgeFunction
 
 
@@ -13,7 +14,7 @@ class Discriminator(nn.Module):
         super().__init__()
         self.edges = EdgeFunction(inputs, hidden, hidden)
         self.head = nn.Sequential(
-            nn.Linear(hidden + inputs, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, 1)
+            Linear(hidden + inputs, hidden), nn.SiLU(), Linear(hidden, hidden), nn.SiLU(), Linear(hidden, 1)
         )
 
     def forward(self, x: Tensor, action: Tensor) -> Tensor:

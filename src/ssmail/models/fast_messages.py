@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 CHUNK = 2**18  # numbers in a tensor that is worked on: a megabyte of single precision
-DENSE_UP_TO = 8  # agents: up to this many, all pairs at once are faster than sender by sender
+DENSE_UP_TO = 8
 ONE_BY_ONE_UP_TO = 2**13  # edges times hidden size: up to this many, two calls of torch's LSTM are faster
 
 Chunk = tuple[slice, slice]  # of the axes B and T
@@ -65,8 +65,11 @@ def sum_over_senders(s: Tensor, r: Tensor, w: Tensor) -> Tensor:
     if s.shape[-3] > DENSE_UP_TO:
         total: Tensor = SumOverSenders.apply(s, r, w)  # type: ignore[no-untyped-call]  # torch's
         return total
-    pairs = torch.relu_(s.unsqueeze(-3) + r.unsqueeze(-4))  # (..., N, N, K, H)
-    return (pairs * w.unsqueeze(-1)).sum(dim=-4)
+    pairs = torch.relu_(s.unsqueeze(-3) + r.unsqueeze(-4)) * w.unsqueeze(-1)  # (..., N, N, K, H)
+    received, *others = pairs.unbind(dim=-4)  # a sum over a short axis takes longer than additions
+    for one in others:
+        received = received + one
+    return received
 
 
 @dataclass(frozen=True)

@@ -42,17 +42,17 @@ class Features:
         return state_size * (1 + self.start) + self.time + self.agents
 
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
-        """Map states (B, T, N, D), the first of them at step `first_step`, and start (B, N, D) to (B, T, N, F)."""
-        b, t, n, _ = states.shape
+        """Map states (..., T, N, D), the first of them at step `first_step`, and start (..., N, D) to (..., T, N, F)."""
+        *lead, t, n, _ = states.shape
         parts = [self.normalize_states(states)]
         if self.time:
             steps = torch.arange(first_step, first_step + t, dtype=states.dtype, device=states.device)
             scaled = 2 * steps / (self.steps - 1) - 1
-            parts.append(scaled.view(1, t, 1, 1).expand(b, t, n, 1))
+            parts.append(scaled.view(t, 1, 1).expand(*lead, t, n, 1))
         if self.start:
-            parts.append(self.normalize_states(start).unsqueeze(1).expand(b, t, n, -1))
+            parts.append(self.normalize_states(start).unsqueeze(-3).expand(*lead, t, n, -1))
         if self.agents:
-            parts.append(torch.eye(n, dtype=states.dtype, device=states.device).expand(b, t, n, n))
+            parts.append(torch.eye(n, dtype=states.dtype, device=states.device).expand(*lead, t, n, n))
         return torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
 
     def normalize_actions(self, actions: Tensor) -> Tensor:

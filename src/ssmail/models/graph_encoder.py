@@ -15,9 +15,27 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.fast_messages import between_different
+from ssmail.models.linear import Linear
 from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
+
+
+class EdgeLSTM(nn.LSTM):
+    """A one-layer LSTM along every edge, or those of S seeds, whose memory then begins with an axis S."""
+
+    def forward(self, sequences: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:  # type: ignore[override]
+        """Map sequences (T, E, D) to outputs (T, E, H) and the memory; both may begin with an axis S."""
+        weights: list[Tensor] = self.all_weights[0]
+        if weights[0].dim() == 2:
+            return remember(weights, sequences, memory)
+        memories = [None] * len(sequences) if memory is None else list(zip(*memory, strict=True))
+        made = [
+            remember([w[s] for w in weights], sequences[s], memories[s])
+            for s in range(len(sequences))
+        ]
+        outputs, hidden, cells = zip(*((out, *kept) for out, kept in made), strict=True)
+        return torch.stack(outputs), (torch.stack(hidden), torch.stack(cells))
 
 
 class GraphEncoder(nn.Module):
@@ -28,25 +46,25 @@ class GraphEncoder(nn.Module):
         self.edges_in = EdgeFunction(inputs, hidden, hidden)
         self.nodes = perceptron(hidden + inputs, hidden, hidden)
         self.edges_out = EdgeFunction(hidden, hidden, hidden)
-        self.lstm = nn.LSTM(hidden, hidden)
-        self.head = nn.Linear(hidden, edge_types)
+        self.lstm = EdgeLSTM(hidden, hidden)
+        self.head = Linear(hidden, edge_types)
 
     def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
         """Map x (B, T, N, D) to logits (B, T, N, N, K) and the memory after the last step.
 
-        The logits of step t depend on x[:, : t + 1] only.
+        With the weights of S seeds, all of them have another axis S in front. The logits of step t depend on x[:, : t + 1] only.
         """
-        b, t, n, _ = x.shape
+        n = x.shape[-2]
         edges = self.edges_in(x)  # (B, T, N, N, H), sender first
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
-        sequences = off_diagonal(edges).transpose(0, 1).flatten(1, 2)  # (T, B * N * (N - 1), H)
-        embedded, memory = remember(self.lstm, sequences, memory)
-        logits = self.head(embedded).view(t, b, n * (n - 1), self.head.out_features).transpose(0, 1)
-        return on_diagonal(logits, n), memory
+        sequences = off_diagonal(edges).transpose(-4, -3)  # (T, B, N * (N - 1), H)
+        embedded, memory = self.lstm(sequences.flatten(-3, -2), memory)
+        logits = self.head(embedded).unflatten(-2, sequences.shape[-3:-1])  # (T, B, N * (N - 1), K)
+        return on_diagonal(logits.transpose(-4, -3), n), memory
 
 
-def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
+def remember(weights: list[Tensor], sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
     """Run a one-layer LSTM over sequences (T, edges, D); return its outputs (T, edges, H) and its memory.
 
     Steps come first because torch's LSTM would copy otherwise. A single step, as in a rollout, calls the cell, which
@@ -54,29 +72,30 @@ def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[T
     """
     steps, edges, _ = sequences.shape
     if memory is None:
-        zeros = sequences.new_zeros(1, edges, lstm.hidden_size)
+        zeros = sequences.new_zeros(1, edges, weights[1].shape[1])
         memory = (zeros, zeros)
     if not edges:
-        return sequences.new_zeros(steps, 0, lstm.hidden_size), memory
+        return sequences.new_zeros(steps, 0, weights[1].shape[1]), memory
     if steps > 1:
-        embedded, (hidden, cell) = lstm(sequences, memory)
+        recorded = torch.is_grad_enabled()
+        embedded, hidden, cell = torch.lstm(sequences, memory, weights, True, 1, 0.0, recorded, False, False)
         return embedded, (hidden, cell)
-    hidden, cell = torch.lstm_cell(sequences[0], [m[0] for m in memory], *lstm.all_weights[0])
+    hidden, cell = torch.lstm_cell(sequences[0], [m[0] for m in memory], *weights)
     return hidden.unsqueeze(0), (hidden.unsqueeze(0), cell.unsqueeze(0))
 
 
 def off_diagonal(pairs: Tensor) -> Tensor:
-    """Select the edges between different agents, row by row: (B, T, N, N, H) -> (B, T, N * (N - 1), H)."""
-    b, t, n, _, h = pairs.shape
-    return between_different(pairs.flatten(0, 1)).reshape(b, t, n * (n - 1), h)
+    """Select the edges between different agents, row by row: (..., N, N, H) -> (..., N * (N - 1), H)."""
+    *lead, n, _, h = pairs.shape
+    return between_different(pairs.flatten(0, -4)).reshape(*lead, n * (n - 1), h)
 
 
 def on_diagonal(edges: Tensor, agents: int) -> Tensor:
     """Invert `off_diagonal`, with zeros on the diagonal."""
-    b, t, _, h = edges.shape
+    *lead, _, h = edges.shape
     n = agents
-    rows = nn.functional.pad(edges.view(b, t, n - 1, n, h), (0, 0, 0, 1)).view(b, t, (n - 1) * (n + 1), h)
-    return nn.functional.pad(rows, (0, 0, 1, 0)).view(b, t, n, n, h)
+    rows = nn.functional.pad(edges.reshape(*lead, n - 1, n, h), (0, 0, 0, 1)).view(*lead, (n - 1) * (n + 1), h)
+    return nn.functional.pad(rows, (0, 0, 1, 0)).view(*lead, n, n, h)
 
 
 @dataclass(frozen=True)
@@ -115,7 +134,7 @@ def few_way_softmax(x: Tensor) -> Tensor:
     return weights / weights.sum(dim=-1, keepdim=True)
 
 
-def graph_entropy(logits: Tensor) -> Tensor:
-    """Return the mean entropy of the edge-type distributions in nats, between 0 and log K."""
+def edge_entropy(logits: Tensor) -> Tensor:
+    """Return the entropies (...) of edge-type distributions with logits (..., K) in nats, between 0 and log K."""
     log_p = torch.log_softmax(logits.movedim(-1, 0).contiguous(), dim=0)  # the last axis is slow for small K
-    return -(log_p.exp() * log_p).sum(dim=0).mean()
+    return -(log_p.exp() * log_p).sum(dim=0)

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import ModelSpec
 from ssmail.models.fast_messages import sum_over_senders
+from ssmail.models.linear import Linear, affine
 
 FAST = True  # False computes every network in its readable form
 
@@ -36,7 +37,7 @@ def both_ends(x: Tensor) -> Tensor:
 
 def perceptron(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """Two linear layers with a SiLU between them."""
-    return nn.Sequential(nn.Linear(inputs, hidden), nn.SiLU(), nn.Linear(hidden, outputs))
+    return nn.Sequential(Linear(inputs, hidden), nn.SiLU(), Linear(hidden, outputs))
 
 
 def sender_weights(agents: int, like: Tensor) -> Tensor:
@@ -56,8 +57,8 @@ class PairLayer(nn.Module):
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.sender = nn.Linear(inputs, outputs, bias=False)
-        self.receiver = nn.Linear(inputs, outputs)
+        self.sender = Linear(inputs, outputs, bias=False)
+        self.receiver = Linear(inputs, outputs)
 
     def gathered(self, x: Tensor) -> Tensor:
         """Apply the layer to every edge in readable form: x (..., N, D) -> (..., N, N - 1, H)."""
@@ -72,8 +73,8 @@ class PairLayer(nn.Module):
         return pairs
 
     def _apply_to(self, ends: Tensor) -> Tensor:
-        weight = torch.cat([self.sender.weight, self.receiver.weight], dim=1)
-        return nn.functional.linear(ends, weight, self.receiver.bias)
+        weight = torch.cat([self.sender.weight, self.receiver.weight], dim=-1)
+        return affine(ends, weight, self.receiver.bias)
 
 
 class EdgeFunction(nn.Module):
@@ -82,7 +83,7 @@ class EdgeFunction(nn.Module):
     def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
         self.first = PairLayer(inputs, hidden)
-        self.second = nn.Linear(hidden, outputs)
+        self.second = Linear(hidden, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the edge embeddings h_(i,j) of all pairs: x (..., N, D) -> (..., N, N, H)."""
@@ -94,7 +95,7 @@ class EdgeFunction(nn.Module):
         agents = x.shape[-2]
         if not FAST:
             if agents == 1:  # without senders, the bias is what remains
-                return self.second.bias.expand(*x.shape[:-1], -1)
+                return affine(x.new_zeros(*x.shape[:-1], self.second.in_features), self.second.weight, self.second.bias)
             embedded: Tensor = self.second(torch.relu(self.first.gathered(x)))  # (..., N, N - 1, H)
             return embedded.mean(dim=-2)
         # The second layer is linear too, so it follows the mean.
@@ -116,8 +117,8 @@ class TypedMessages(nn.Module):
         self.skipped = int(spec.first_type_is_none)
         self.types = spec.edge_types - self.skipped
         self.first = PairLayer(inputs, hidden * self.types)
-        self.second = nn.Linear(hidden * self.types, hidden, bias=False)
-        self.type_bias = nn.Linear(self.types, hidden, bias=False)
+        self.second = Linear(hidden * self.types, hidden, bias=False)
+        self.type_bias = Linear(self.types, hidden, bias=False)
         with torch.no_grad():
             self.type_bias.weight.mul_(spec.graph_gain)
 
@@ -130,9 +131,13 @@ class TypedMessages(nn.Module):
         senders, receivers = edge_ends(x.shape[-2])
         z = graph[..., senders, receivers, self.skipped :]  # (..., N, N - 1, K)
         hidden = torch.relu(self.first.gathered(x))
-        hidden = hidden.view(*hidden.shape[:-1], self.types, len(self.second.weight))  # (..., N, N - 1, K, H)
-        weight = self.second.weight.view(-1, *hidden.shape[-2:])  # (H, K, H)
-        f = torch.einsum("...kh,okh->...ko", hidden, weight) + self.type_bias.weight.t()  # f_e^k([x_i, x_j])
+        layers = zip(
+            hidden.chunk(self.types, dim=-1),  # (..., N, N - 1, H) of each type
+            self.second.weight.chunk(self.types, dim=-1),
+            self.type_bias.weight.unbind(dim=-1),
+            strict=True,
+        )
+        f = torch.stack([affine(h, weight, bias) for h, weight, bias in layers], dim=-2)  # f_e^k([x_i, x_j])
         return (z.unsqueeze(-1) * f).sum(dim=(-3, -2)) / max(x.shape[-2] - 1, 1)
 
     def _per_agent(self, x: Tensor, graph: Tensor) -> Tensor:

@@ -216,8 +216,8 @@ class DynamicEncoder(nn.Module):
             past, both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
         else:
             sequences = edges.tensor().flatten(1, 3)  # (T, B * N * (N - 1), H)
-            past, _ = remember(self.past, sequences, None)
-            future = remember(self.future, sequences.flip(0), None)[0].flip(0)
+            past, _ = remember(self.past.all_weights[0], sequences, None)
+            future = remember(self.future.all_weights[0], sequences.flip(0), None)[0].flip(0)
             both = torch.cat([past, future], dim=-1)
         return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
 
@@ -228,7 +228,7 @@ class DynamicEncoder(nn.Module):
         the same logits; in training mode, batch norm depends on the steps that are read together.
         """
         sequences = self.embedding(x.transpose(0, 1)).tensor().flatten(1, 3)
-        past, memory = remember(self.past, sequences, memory)
+        past, memory = remember(self.past.all_weights[0], sequences, memory)
         return self._logits(self.prior_head, past, x), memory
 
     def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:

@@ -1,56 +1,43 @@
-"""G-SAC (section 3.2.2): a graph policy, twin critics with target networks, a temperature, and their joint update."""
+"""G-SAC (section 3.2.2): a graph policy, twin critics with target networks, a temperature, and their joint update.
 
-from collections.abc import Callable, Iterable
+`ActorCritic` is the state of one seed, and `SoftActorCritic` the algorithm, on the states of one or more seeds at once.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ssmail.config.sections import SacSpec
+from ssmail.losses import PER_SEED
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
 from ssmail.models.critic import TwinCritic
-from ssmail.models.graph_encoder import graph_entropy
+from ssmail.models.graph_encoder import edge_entropy
+from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import entries, fitted, load_part
-from ssmail.training.optimization import clipped_step
 from ssmail.training.rollout import PolicyPredictor
-from ssmail.training.seeding import Generators
+from ssmail.training.seeding import Generators, drawn
+from ssmail.training.stacking import Block, StackedAdam, stacked_modules
 
-Reward = Callable[[Tensor, Tensor], Tensor]  # features (B, T, N, F), actions as read (B, T, N, A) -> rewards (B, T, N)
-
-
-@dataclass(frozen=True)
-class Transitions:
-    """A training batch of actor and critics: C time steps from each of B trajectories."""
-
-    x: Tensor  # (B, C, N, F)
-    actions: Tensor  # (B, C, N, A), as the networks read them
-    graph: Tensor  # (B, C, N, N, K), with gradient
-    velocity: Tensor  # (B, C, N, A) before the action
-    next_x: Tensor
-    next_graph: Tensor  # detached
-    next_velocity: Tensor
-    edge_entropy: Tensor  # nats, mean over all steps
+Reward = Callable[[Tensor, Tensor], Tensor]
+"""Maps features (S, B, C, N, F) and actions as read (S, B, C, N, A) to rewards (S, B, C, N)."""
 
 
 class ActorCritic:
-    """Policy, critics and temperature with their optimizers, whose learning rates the caller sets.
+    """Policy, critics and temperature of one seed, with their optimizers, whose learning rates the caller sets."""
 
-    `gradient_clip` bounds the norm of each network's gradient.
-    """
-
-    def __init__(
-        self, spec: SacSpec, actor: PolicyPredictor, critic: TwinCritic, generators: Generators, gradient_clip: float
-    ) -> None:
-        self.spec, self.gradient_clip = spec, gradient_clip
+    def __init__(self, spec: SacSpec, actor: PolicyPredictor, critic: TwinCritic, generators: Generators) -> None:
+        self.spec, self.actor, self.generators = spec, actor, generators
         self.policy, self.critic = actor.model, critic
-        self.features, self.integrator, self.generators = actor.features, actor.integrator, generators
-        self.device = next(critic.parameters()).device
         self.target_critic = deepcopy(critic).requires_grad_(False)
-        self.log_temperature = torch.tensor(max(spec.temperature, 1e-8), device=self.device).log().requires_grad_()
-        self.optimizers: dict[str, torch.optim.Optimizer] = {
+        self.averaged = None if spec.average is None else deepcopy(actor.model).requires_grad_(False)
+        device = next(critic.parameters()).device
+        self.log_temperature = torch.tensor(max(spec.temperature, 1e-8), device=device).log().requires_grad_()
+        self.optimizers = {
             "actor": torch.optim.Adam(self.policy.parameters(), lr=spec.actor_learning_rate, fused=True),
             "critic": torch.optim.Adam(critic.parameters(), lr=spec.critic_learning_rate, fused=True),
             "temperature": torch.optim.Adam([self.log_temperature], lr=spec.temperature_learning_rate, fused=True),
@@ -61,121 +48,11 @@ class ActorCritic:
             "temperature": spec.actor_learning_rate_final,
         }
 
-    @property
-    def temperature(self) -> Tensor:
-        """The entropy's weight, detached."""
-        fixed = torch.tensor(self.spec.temperature, device=self.device)
-        return self.log_temperature.detach().exp() if self.spec.automatic_temperature else fixed
-
-    def update(
-        self, batch: Batch, chosen: Callable[[int], Tensor], reward: Reward, *, actor_learns: bool = True
-    ) -> dict[str, Tensor]:
-        """Take one SAC step on whole trajectories; `chosen` draws which of their T time steps to use.
-
-        Rewards are recomputed from the stored states and actions. Without `actor_learns` the policy and its temperature
-        stay fixed while the critics learn the policy's value. Returns losses and means as scalar tensors.
-        """
-        at = self._transitions(batch, chosen)
-        # Critics: one regression step to r + gamma * (min target Q - temperature * log pi) of the next state.
-        with torch.no_grad():
-            rewards = reward(at.x, at.actions)
-            next_action, next_log_prob = self.policy.actor.sample_with_log_prob(
-                at.next_x, at.next_graph, at.next_velocity, self._noise(at.actions)
-            )
-            next_action = self.features.normalize_actions(next_action)
-            next_q = self.target_critic(at.next_x, next_action, at.next_graph)
-            target = critic_target(rewards, next_q, next_log_prob, self.temperature, self.spec.gamma)
-        value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
-        self._step("critic", value_loss, self.critic.parameters())
-        # Actor and temperature.
-        policy_loss, log_prob = self._update_actor(at, actor_learns)
-        # Target networks.
-        self._update_target()
-        return {
-            "critic/loss": value_loss,
-            "actor/loss": policy_loss,
-            "temperature": self.temperature,
-            "entropy": -log_prob.mean(),
-            "graph/entropy": at.edge_entropy,
-            "reward": rewards.mean(),
-        }
-
-    def _transitions(self, batch: Batch, chosen: Callable[[int], Tensor]) -> Transitions:
-        """Infer the graphs of whole trajectories, then pick time steps."""
-        a = batch.actions.shape[-1]
-        states = batch.states[:, :-1]
-        next_states = self.integrator.step(states, batch.actions)
-        x = self.features(states, batch.states[:, 0])
-        next_x = self.features(next_states, batch.states[:, 0], first_step=1)
-        # One pass of the encoder over all T + 1 states gives the graphs at both ends of every transition.
-        history = torch.cat([x, next_x[:, -1:]], dim=1)
-        graphs, edge_entropy = self._graphs(history)
-        at = chosen(x.shape[1])
-        return Transitions(
-            x=x[:, at],
-            actions=self.features.normalize_actions(batch.actions[:, at]),
-            graph=graphs[:, at],
-            velocity=states[:, at, :, a:],
-            next_x=next_x[:, at],
-            next_graph=graphs[:, at + 1].detach(),
-            next_velocity=next_states[:, at, :, a:],
-            edge_entropy=edge_entropy,
-        )
-
-    def _graphs(self, history: Tensor) -> tuple[Tensor, Tensor]:
-        """Sample graphs (B, T, N, N, K) from features (B, T, N, F), and return them with their entropy in nats.
-
-        Truncated backpropagation through time: with sac.encoder_steps, the gradient flows through a random window of
-        that many consecutive steps only. The values do not depend on the window.
-        """
-        b, t, n, _ = history.shape
-        noise = (
-            self.policy.draw_graph_noise(b, t, n, self.generators["policy"]).to(self.device).expand(b, t, -1, -1, -1)
-        )
-        learned = min(self.spec.encoder_steps or t, t)
-        start = int(torch.randint(t - learned + 1, (), generator=self.generators["data"])) if learned < t else 0
-        # Read the steps before, in and after the window in turn; only the window records a gradient.
-        graphs, logits, memory = [], [], None
-        for first, last in ((0, start), (start, start + learned), (start + learned, t)):
-            if first < last:
-                with torch.set_grad_enabled(first == start):
-                    graph, logit, memory = self.policy.graphs(history[:, first:last], noise[:, first:last], memory)
-                graphs.append(graph)
-                logits.append(logit)
-        return torch.cat(graphs, dim=1), graph_entropy(torch.cat(logits, dim=1))
-
-    def _update_actor(self, at: Transitions, learns: bool) -> tuple[Tensor, Tensor]:
-        """Take one step of actor and graph encoder, then one of the temperature; return the loss and log pi."""
-        action, log_prob = self.policy.actor.sample_with_log_prob(at.x, at.graph, at.velocity, self._noise(at.actions))
-        action = self.features.normalize_actions(action)
-        self.critic.requires_grad_(False)  # the actor's gradient flows through the critics but not into them
-        loss = actor_loss(self.critic(at.x, action, at.graph.detach()), log_prob, self.temperature)
-        self.critic.requires_grad_(True)
-        if learns:
-            self._step("actor", loss - self.spec.graph_entropy * at.edge_entropy, self.policy.parameters())
-        if learns and self.spec.automatic_temperature:
-            target_entropy = self.spec.target_entropy * at.actions.shape[-1]
-            self._step(
-                "temperature", temperature_loss(self.log_temperature, log_prob, target_entropy), [self.log_temperature]
-            )
-        return loss, log_prob
-
-    def _noise(self, like: Tensor) -> Tensor:
-        return torch.randn(like.shape, generator=self.generators["policy"]).to(self.device)
-
-    def _step(self, name: str, loss: Tensor, parameters: Iterable[Tensor]) -> None:
-        clipped_step(self.optimizers[name], loss, parameters, self.gradient_clip)
-
-    @torch.no_grad()
-    def _update_target(self) -> None:
-        """Move the target networks towards the critics by Polyak averaging: target += polyak * (critic - target)."""
-        target: list[Tensor] = list(self.target_critic.parameters())
-        source: list[Tensor] = list(self.critic.parameters())
-        torch._foreach_lerp_(target, source, self.spec.polyak)
-
     def state_dict(self) -> dict[str, Any]:
         """Return everything that an update changes."""
+        averaged = {} if self.averaged is None else {"averaged": self.averaged.state_dict()}
         return {
+            **averaged,
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
             "target_critic": self.target_critic.state_dict(),
@@ -188,10 +65,218 @@ class ActorCritic:
         own = self.state_dict()
         state = entries(state, own, "learner.actor_critic")
         optimizers = entries(state["optimizers"], self.optimizers, "learner.actor_critic.optimizers")
-        for name in ("policy", "critic", "target_critic"):
+        for name in ("policy", "critic", "target_critic", *(("averaged",) if self.averaged else ())):
             load_part(getattr(self, name), state[name], f"learner.actor_critic.{name}")
         for name, optimizer in self.optimizers.items():
             load_part(optimizer, optimizers[name], f"learner.actor_critic.optimizers.{name}")
         with torch.no_grad():
             where = "learner.actor_critic.log_temperature"
             self.log_temperature.copy_(fitted(state["log_temperature"], own["log_temperature"], where))
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A training batch of actors and critics: C time steps from each of B trajectories of S seeds."""
+
+    x: Tensor  # (S, B, C, N, F)
+    actions: Tensor  # (S, B, C, N, A), as the networks read them
+    graph: Tensor  # (S, B, C, N, N, K), with gradient
+    velocity: Tensor  # (S, B, C, N, A) before the action
+    next_x: Tensor
+    next_graph: Tensor  # detached
+    next_velocity: Tensor
+    edge_entropy: Tensor  # (S,), nats, means over all steps
+    # for what comes after these steps
+    states: Tensor  # (S, B, C, N, D)
+    steps: Tensor  # (S, C)
+    histories: Tensor  # (S, B, T + 1, N, F) features of the whole trajectories
+    graphs: Tensor  # (S, B, T + 1, N, N, K), with gradient
+
+
+class SoftActorCritic:
+    """Updates of the actors and critics of S seeds at once, each as if it were alone.
+
+    The norm of each network's gradient is clipped to `gradient_clip`.
+    """
+
+    def __init__(self, seeds: Sequence[ActorCritic], gradient_clip: float) -> None:
+        first = seeds[0]
+        self.spec, self.features, self.integrator = first.spec, first.actor.features, first.actor.integrator
+        self.generators = [seed.generators for seed in seeds]
+        self.policy: GraphPolicy
+        self.critic: TwinCritic
+        self.target_critic: TwinCritic
+        self.policy, policy = stacked_modules([seed.policy for seed in seeds])
+        self.critic, critic = stacked_modules([seed.critic for seed in seeds])
+        self.target_critic, target = stacked_modules([seed.target_critic for seed in seeds])
+        temperature = Block([[seed.log_temperature] for seed in seeds])
+        self.log_temperature = nn.Parameter(temperature.parts[0])
+        learned: dict[str, tuple[Iterable[nn.Parameter], Block]] = {
+            "actor": (self.policy.parameters(), policy),
+            "critic": (self.critic.parameters(), critic),
+            "temperature": ([self.log_temperature], temperature),
+        }
+        self.optimizers = {
+            name: StackedAdam(list(parameters), block, [seed.optimizers[name] for seed in seeds], gradient_clip)
+            for name, (parameters, block) in learned.items()
+        }
+        self.policy_values, self.critic_values, self.target_values = policy.values, critic.values, target.values
+        averaged = [list(seed.averaged.parameters()) for seed in seeds if seed.averaged is not None]
+        self.averaged_values = Block(averaged).values if averaged else None
+
+    @property
+    def temperature(self) -> Tensor:
+        """The entropy's weights (S,), detached."""
+        learned = self.log_temperature.detach().exp()
+        return learned if self.spec.automatic_temperature else torch.full_like(learned, self.spec.temperature)
+
+    def update(self, batch: Batch, steps: Tensor, reward: Reward, *, actor_learns: bool = True) -> dict[str, Tensor]:
+        """Take one SAC step on whole trajectories (S, B, ...), at their time steps `steps` (S, C).
+
+        Rewards are recomputed from the stored states and actions. Without `actor_learns` the policies and their
+        temperatures stay fixed while the critics learn the policies' values. Returns losses and means, (S,) each.
+        """
+        at = self._transitions(batch, steps)
+        temperature = self.temperature.view(-1, 1, 1, 1)
+        # Critics: one regression step to r + gamma * (min target Q - temperature * log pi) of the next state.
+        with torch.no_grad():
+            rewards = reward(at.x, at.actions)
+            next_action, next_log_prob = self._act(at.next_x, at.next_graph, at.next_velocity)
+            next_q = self.target_critic(at.next_x, next_action, at.next_graph)
+            target = critic_target(rewards, next_q, next_log_prob, temperature, self.spec.gamma)
+        value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
+        self.optimizers["critic"].step(value_loss)
+        # Actor and temperature.
+        policy_loss, log_prob = self._update_actor(at, temperature, reward, actor_learns)
+        # Target networks.
+        self._update_target()
+        return {
+            "critic/loss": value_loss,
+            "actor/loss": policy_loss,
+            "temperature": self.temperature,
+            "entropy": -log_prob.mean(dim=PER_SEED),
+            "graph/entropy": at.edge_entropy,
+            "reward": rewards.mean(dim=PER_SEED),
+        }
+
+    def _transitions(self, batch: Batch, steps: Tensor) -> Transitions:
+        """Infer the graphs of whole trajectories, then pick time steps."""
+        a = batch.actions.shape[-1]
+        start, states = batch.states[..., 0, :, :], batch.states[..., :-1, :, :]
+        next_states = self.integrator.step(states, batch.actions)
+        x = self.features(states, start)
+        next_x = self.features(next_states, start, first_step=1)
+        # One pass of the encoder over all T + 1 states gives the graphs at both ends of every transition.
+        histories = torch.cat([x, next_x[..., -1:, :, :]], dim=-3)
+        graphs, entropy = self._graphs(histories)
+        now = at_steps(states, steps)
+        return Transitions(
+            x=at_steps(x, steps),
+            actions=self.features.normalize_actions(at_steps(batch.actions, steps)),
+            graph=at_steps(graphs, steps),
+            velocity=now[..., a:],
+            next_x=at_steps(next_x, steps),
+            next_graph=at_steps(graphs.detach(), steps + 1),
+            next_velocity=at_steps(next_states, steps)[..., a:],
+            edge_entropy=entropy,
+            states=now,
+            steps=steps,
+            histories=histories,
+            graphs=graphs,
+        )
+
+    def _graphs(self, history: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample graphs (S, B, T, N, N, K) from features (S, B, T, N, F); return them with their entropy (S,) in nats.
+
+        Truncated backpropagation through time: with sac.encoder_steps, the gradient flows through a random window of
+        that many consecutive steps only. The values do not depend on the window.
+        """
+        _, b, t, n, _ = history.shape
+        noise = drawn(self.generators, "policy", lambda g: self.policy.draw_graph_noise(b, t, n, g))
+        noise = noise.to(history.device).expand(-1, b, t, -1, -1, -1)
+        learned = min(self.spec.encoder_steps or t, t)
+        if learned < t:
+            return self._graphs_of_windows(history, noise, learned)
+        graphs, logits, _ = self.policy.graphs(history, noise)
+        return graphs, edge_entropy(logits).mean(dim=(1, 2, 3, 4))
+
+    def _graphs_of_windows(self, history: Tensor, noise: Tensor, learned: int) -> tuple[Tensor, Tensor]:
+        """Read the steps before, in and after a window of `learned` steps in turn; only the window has a gradient.
+
+        For a single seed, because every seed has a window of its own.
+        """
+        t = history.shape[2]
+        (generator,) = self.generators
+        start = int(torch.randint(t - learned + 1, (), generator=generator["data"]))
+        graphs, logits, memory = [], [], None
+        for first, last in ((0, start), (start, start + learned), (start + learned, t)):
+            if first < last:
+                with torch.set_grad_enabled(first == start):
+                    graph, logit, memory = self.policy.graphs(history[:, :, first:last], noise[:, :, first:last], memory)
+                graphs.append(graph)
+                logits.append(logit)
+        return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2, 3, 4))
+
+    def _act(self, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample actions, as the networks read them, with their log-probabilities."""
+        action, log_prob = self._sample(x, graph, velocity)
+        return self.features.normalize_actions(action), log_prob
+
+    def _sample(self, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+        """Sample actions, in scaled units, with their log-probabilities."""
+        noise = drawn(self.generators, "policy", lambda g: torch.randn(velocity.shape[1:], generator=g))
+        return self.policy.actor.sample_with_log_prob(x, graph, velocity, noise.to(velocity.device))
+
+    def _update_actor(
+        self, at: Transitions, temperature: Tensor, reward: Reward, learns: bool
+    ) -> tuple[Tensor, Tensor]:
+        """Take one step of actors and graph encoders, then one of the temperatures; return the losses and log pi."""
+        loss, log_prob = self._actor_loss(at, temperature, reward)
+        if learns:
+            self.optimizers["actor"].step(loss - self.spec.graph_entropy * at.edge_entropy)
+        if learns and self.spec.automatic_temperature:
+            target_entropy = self.spec.target_entropy * at.actions.shape[-1]
+            learned = self.log_temperature.view(-1, 1, 1, 1)
+            self.optimizers["temperature"].step(temperature_loss(learned, log_prob, target_entropy))
+        return loss, log_prob
+
+    def _actor_loss(self, at: Transitions, temperature: Tensor, reward: Reward) -> tuple[Tensor, Tensor]:
+        """Return minus the soft value (S,) of the policy at the transitions' states, and log pi of its actions there.
+
+        The value is r + gamma * r' + ... of sac.expansion_steps steps, then that of the critics, each less temperature
+        * log pi (model-based value expansion, Feinberg et al. 2018). Rewards and dynamics are known functions, so the
+        gradient follows the policy through all of these steps (Heess et al. 2015). The graphs are those of the stored
+        trajectory at the same time.
+        """
+        graph, states, read = at.graph, at.states, at.x
+        size, last = states.shape[-1], at.graphs.shape[2] - 1
+        earlier, log_probs = torch.zeros_like(at.x[..., 0]), []
+        for k in range(self.spec.expansion_steps + 1):
+            if k:
+                now = (at.steps + k).clamp(max=last)
+                others = at_steps(at.histories, now)[..., size:]
+                read = torch.cat([self.features.normalize_states(states), others], dim=-1)
+                graph = at_steps(at.graphs, now)
+            action, log_prob = self._sample(read, graph, states[..., size // 2 :])
+            log_probs.append(log_prob)
+            as_read = self.features.normalize_actions(action)
+            if k < self.spec.expansion_steps:
+                earlier = earlier + self.spec.gamma**k * (reward(read, as_read) - temperature * log_prob)
+                states = self.integrator.step(states, action)
+        q = self.critic(read, as_read, graph.detach())
+        tail = actor_loss(q, log_prob, temperature)
+        return self.spec.gamma**self.spec.expansion_steps * tail - earlier.mean(dim=PER_SEED), log_probs[0]
+
+    @torch.no_grad()
+    def _update_target(self) -> None:
+        """Move the target networks towards the critics by Polyak averaging: target += polyak * (critic - target)."""
+        self.target_values.lerp_(self.critic_values, self.spec.polyak)
+        if self.averaged_values is not None and self.spec.average is not None:
+            self.averaged_values.lerp_(self.policy_values, self.spec.average)
+
+
+def at_steps(x: Tensor, steps: Tensor) -> Tensor:
+    """Return x (S, B, T, ...) at the time steps (S, C) of each seed: (S, B, C, ...)."""
+    s, b = x.shape[:2]
+    seeds, rows = torch.arange(s, device=x.device), torch.arange(b, device=x.device)
+    return x[seeds.view(s, 1, 1), rows.view(1, b, 1), steps.unsqueeze(1)]

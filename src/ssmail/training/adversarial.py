@@ -1,16 +1,17 @@
-"""The adversarial learner (Alg. 1): a discriminator, and a soft actor-critic that maximizes the reward made of it.
+"""Adversarial learning (Alg. 1): a discriminator, and a soft actor-critic that maximizes the reward made of it.
 
 ssail, gail and wail differ in one row of OBJECTIVES, and in whether tau_alpha joins the batches (self-supervision,
-section 3.1.2).
+section 3.1.2). `AdversarialLearner` is the state of one seed, and `AdversarialTraining` the algorithm, on the states of
+one or more seeds at once.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import Pairing, SelfSupervisionSpec, required
+from ssmail.config.sections import AdversarialSpec, Pairing, SelfSupervisionSpec, required
 from ssmail.config.user_functions import load_label
 from ssmail.losses import Terms
 from ssmail.losses.adversarial import (
@@ -26,13 +27,15 @@ from ssmail.losses.labels import checked_label
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
-from ssmail.training.actor_critic import ActorCritic
+from ssmail.training.actor_critic import ActorCritic, SoftActorCritic, at_steps
 from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext
-from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
+from ssmail.training.optimization import LearningRateSchedule
 from ssmail.training.rollout import PolicyPredictor
+from ssmail.training.seeding import drawn
+from ssmail.training.stacking import StackedAdam, stacked_modules
 
 
 @dataclass(frozen=True)
@@ -55,27 +58,27 @@ OBJECTIVES = {
 
 
 class AdversarialLearner:
-    """Alternates discriminator steps and soft actor-critic steps on trajectories from a replay buffer."""
+    """The networks, optimizers and replay buffer of one seed."""
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
         model, sac = required(spec.model), required(spec.sac)
         self.context, self.objective = context, OBJECTIVES[spec.method]
         self.adversarial, self.training = required(spec.adversarial), required(spec.training)
-        self.curriculum = required(spec.curriculum)
-        self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
+        self.generators = context.generators
         self.label = None
-        if self.supervision:
-            self.label = checked_label(self.supervision, load_label(self.supervision.label))
-        self.experts, self.generators, self.device = context.experts, context.generators, context.device
+        if spec.self_supervision:
+            self.label = checked_label(spec.self_supervision, load_label(spec.self_supervision.label))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            self.predictor = PolicyPredictor.create(model, self.experts, context.integrator)
+            self.predictor = PolicyPredictor.create(model, context.experts, context.integrator)
             self.features = self.predictor.features
-            inputs = self.features.size(self.experts.states.shape[-1]) + self.experts.actions.shape[-1]
-            critic = TwinCritic(inputs, model).to(self.device)
-            self.discriminator = Discriminator(inputs, model.hidden).to(self.device)
-        self.actor_critic = ActorCritic(sac, self.predictor, critic, self.generators, self.training.gradient_clip)
+            inputs = self.features.size(context.experts.states.shape[-1]) + context.experts.actions.shape[-1]
+            critic = TwinCritic(inputs, model).to(context.device)
+            self.discriminator = Discriminator(inputs, model.hidden).to(context.device)
+        self.actor_critic = ActorCritic(sac, self.predictor, critic, self.generators)
+        if self.actor_critic.averaged is not None:
+            self.predictor = replace(self.predictor, model=self.actor_critic.averaged)
         self.optimizer = torch.optim.Adam(
             self.discriminator.parameters(),
             lr=self.adversarial.learning_rate,
@@ -87,131 +90,24 @@ class AdversarialLearner:
             {**self.actor_critic.optimizers, "discriminator": self.optimizer},
             {**self.actor_critic.final_rates, "discriminator": self.adversarial.learning_rate_final},
         )
-        self.replay = ReplayBuffer(self.adversarial.replay, self.experts)
+        self.replay = ReplayBuffer(self.adversarial.replay, context.experts)
 
     def networks(self) -> list[nn.Module]:
         """Return policy, critics and discriminator."""
         return [self.actor_critic.policy, self.actor_critic.critic, self.discriminator]
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
-        """Roll out once under the curriculum, then take training.updates updates (Alg. 1)."""
-        frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
-        self.schedule.set(epoch)
-        # tau_G from the current policy, into the replay buffer.
-        latest, interventions = self.generate(frequency)
-        self.replay.add(latest)
-        # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
-        actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
-        values = mean_metrics([self.update(latest, actor_learns=actor_learns) for _ in range(self.training.updates)])
-        return values | curriculum_metrics(frequency, [interventions])
+        """Train this seed alone; see `AdversarialTraining.run_epoch`."""
+        return self.run_epochs([self], epoch)[0]
 
-    def generate(self, frequency: float) -> tuple[Batch, Tensor]:
-        """Generate tau_G from random training starts, and return it with the interventions (B, T).
-
-        `frequency` is the curriculum's probability of an intervention per step (trajectory forcing, section 3.3).
-        """
-        count, steps = self.adversarial.rollouts, self.context.steps
-        source = torch.randint(len(self.experts), (count,), generator=self.generators["data"]).to(self.device)
-        interventions = draw_interventions(count, steps, frequency, self.generators["curriculum"])
-        expert = self.experts.states[source]
-        made = self.predictor.rollout(
-            expert[:, :1],
-            steps,
-            self.generators["policy"],
-            expert=expert,
-            interventions=interventions.to(self.device) if frequency > 0 else None,
-        )
-        return Batch(made.states, made.actions, source), interventions
-
-    def update(self, latest: Batch, *, actor_learns: bool = True) -> dict[str, float]:
-        """Take adversarial.updates discriminator steps, then one SAC step (two time scales). Returns mean losses."""
-        logs = [self._update_discriminator(latest) for _ in range(self.adversarial.updates)]
-        values = self.actor_critic.update(self._actor_batch(), self._pick_steps, self.reward, actor_learns=actor_learns)
-        return mean_metrics(logs) | {name: float(value.detach()) for name, value in values.items()}
-
-    def _update_discriminator(self, latest: Batch) -> dict[str, float]:
-        # tau_G: fresh rollouts, and a share of past ones from the replay buffer. tau_E: the expert's.
-        b = self.training.batch
-        past = round(b * self.adversarial.past_share)
-        parts = [latest.draw(b - past, self.generators["data"])] if past < b else []
-        if past:
-            parts.append(self.replay.sample(past, self.generators["data"]))
-        batches = [Batch.concatenate(parts), self.experts.draw(b, self.generators["data"])]
-        # tau_alpha and its labels (self-supervision).
-        labels: tuple[Tensor, ...] = ()
-        if self.supervision and self.label:
-            mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
-            batches.append(mixed)
-            labels = (self.label(alpha),)
-        # One pass of D over all parts at the same random time steps; its outputs are then split again (Eq. 3).
-        everything = Batch.concatenate(batches)
-        chosen = self._pick_steps(everything.actions.shape[1])
-        states, actions = everything.states[:, :-1], everything.actions[:, chosen]
-        x = self._add_input_noise(self.features(states, states[:, 0])[:, chosen], states.shape[-1])
-        actions = self._add_input_noise(self.features.normalize_actions(actions))
-        loss, terms = self.objective.loss(*self.discriminator(x, actions).chunk(len(batches)), *labels)
-        # wail bounds D's slope by a gradient penalty, or by clipping its weights.
-        if self.wasserstein and self.wasserstein.constraint == "penalty":
-            (x_g, x_e), (a_g, a_e) = x.chunk(2), actions.chunk(2)
-            weight = torch.rand(x_g.shape[:2], generator=self.generators["data"]).to(self.device)
-            penalty = gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
-            terms["penalty"] = self.wasserstein.penalty * penalty
-            loss = loss + terms["penalty"]
-        clipped_step(self.optimizer, loss, self.discriminator.parameters(), self.training.gradient_clip)
-        if self.wasserstein and self.wasserstein.constraint == "clipping":
-            with torch.no_grad():
-                for parameter in self.discriminator.parameters():
-                    parameter.clamp_(-self.wasserstein.clip, self.wasserstein.clip)
-        return {f"discriminator/{name}": float(value.detach()) for name, value in {"loss": loss, **terms}.items()}
-
-    def _actor_batch(self) -> Batch:
-        """Draw the actor-critic's batch from the replay buffer.
-
-        With self-supervision, tau_alpha replaces the first self_supervision.actor_share of tau_G: the dynamics are
-        affine, so an off-policy critic can learn from the mix (section 3.1.2).
-        """
-        generated = self.replay.sample(self.training.batch, self.generators["data"])
-        if not self.supervision:
-            return generated
-        count = round(len(generated) * self.supervision.actor_share)
-        mixed, _ = self._mixed(generated[torch.arange(count)], self.supervision, self.supervision.actor_pairing)
-        return Batch.concatenate([mixed, generated[torch.arange(count, len(generated))]])
+    @staticmethod
+    def run_epochs(learners: "Sequence[AdversarialLearner]", epoch: int) -> list[dict[str, float]]:
+        """Train seeds of one spec at once; see `AdversarialTraining.run_epoch`."""
+        return AdversarialTraining(learners).run_epoch(epoch)
 
     def reward(self, x: Tensor, actions: Tensor) -> Tensor:
-        """Return the rewards (..., N) of features x (..., N, F) and actions (..., N, A).
-
-        The method's reward with the current discriminator, scaled by adversarial.reward_scale and clipped to
-        adversarial.reward_limit.
-        """
-        reward = self.adversarial.reward_scale * self.objective.reward(self.discriminator(x, actions))
-        limit = self.adversarial.reward_limit
-        return reward if limit is None else reward.clamp(-limit, limit)
-
-    def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
-        """Return the expert trajectory with which to mix each generated one."""
-        if pairing == "start":
-            return self.experts[generated.source]
-        if pairing == "nearest":
-            return self.experts[nearest(generated.states, self.experts.states)]
-        drawn = self.experts.draw(len(generated), self.generators["data"])
-        return drawn[assignment(generated.states, drawn.states)]
-
-    def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
-        """Mix a batch of tau_G with its expert partners: tau_alpha and alpha (B,), section 3.1."""
-        alpha = sample_alpha(len(generated), supervision.alpha_pieces, self.generators["alpha"]).to(self.device)
-        expert = self._pair(generated, pairing)
-        states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
-        return Batch(states, actions, generated.source), alpha
-
-    def _pick_steps(self, steps: int) -> Tensor:
-        """Draw the time steps of an update in random order: all, or adversarial.time_steps of them."""
-        order = torch.randperm(steps, generator=self.generators["data"])
-        return order[: self.adversarial.time_steps].to(self.device)
-
-    def _add_input_noise(self, inputs: Tensor, features: int | None = None) -> Tensor:
-        """Add Gaussian noise to the first `features` inputs (all by default), so that D ignores jitter."""
-        noisy = add_noise(inputs[..., :features], self.adversarial.input_noise, self.generators["data"])
-        return noisy if features is None else torch.cat([noisy, inputs[..., features:]], dim=-1)
+        """Return the rewards (..., N) of features x (..., N, F) and actions (..., N, A), with the current networks."""
+        return scaled_reward(self.adversarial, self.objective.reward(self.discriminator(x, actions)))
 
     def parts(self) -> Mapping[str, Stateful]:
         """Return all networks, optimizers and the replay buffer."""
@@ -221,3 +117,178 @@ class AdversarialLearner:
             "optimizer": self.optimizer,
             "replay": self.replay,
         }
+
+
+def scaled_reward(spec: AdversarialSpec, reward: Tensor) -> Tensor:
+    """Return a method's reward, scaled by adversarial.reward_scale and clipped to adversarial.reward_limit."""
+    scaled = spec.reward_scale * reward
+    return scaled if spec.reward_limit is None else scaled.clamp(-spec.reward_limit, spec.reward_limit)
+
+
+class AdversarialTraining:
+    """Alternates discriminator steps and soft actor-critic steps on trajectories from replay buffers.
+
+    It trains the networks of S seeds of one spec at once. Every seed draws from its own generators, and its numbers are
+    those of the seed trained alone. Trajectories and networks have an axis S in front.
+    """
+
+    def __init__(self, seeds: Sequence[AdversarialLearner]) -> None:
+        first = seeds[0]
+        spec, context = first.context.spec, first.context
+        self.seeds, self.generators = seeds, [seed.generators for seed in seeds]
+        self.context, self.objective, self.label, self.features = context, first.objective, first.label, first.features
+        self.adversarial, self.training = first.adversarial, first.training
+        self.curriculum = required(spec.curriculum)
+        self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
+        self.experts, self.device = context.experts, context.device
+        self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
+        self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
+        self.discriminator, block = stacked_modules([seed.discriminator for seed in seeds])
+        self.optimizer = StackedAdam(
+            list(self.discriminator.parameters()),
+            block,
+            [seed.optimizer for seed in seeds],
+            self.training.gradient_clip,
+        )
+
+    def run_epoch(self, epoch: int) -> list[dict[str, float]]:
+        """Roll out once under the curriculum, then take training.updates updates (Alg. 1).
+
+        Returns the metrics of each seed for epoch 0 .. epochs - 1.
+        """
+        frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
+        for seed in self.seeds:
+            seed.schedule.set(epoch)
+        # tau_G from the current policy, into the replay buffer.
+        latest, interventions = self.generate(frequency)
+        for seed, made in zip(self.seeds, latest.of_each(), strict=True):
+            seed.replay.add(made)
+        replay = Batch.of_seeds([required(seed.replay.kept) for seed in self.seeds])
+        # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
+        actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
+        logs = [self.update(latest, replay, actor_learns=actor_learns) for _ in range(self.training.updates)]
+        means = {name: torch.stack([log[name] for log in logs]).double().mean(dim=0).tolist() for name in logs[0]}
+        return [
+            {name: values[s] for name, values in means.items()} | curriculum_metrics(frequency, [interventions[s]])
+            for s in range(len(self.seeds))
+        ]
+
+    def generate(self, frequency: float) -> tuple[Batch, Tensor]:
+        """Generate tau_G from random training starts, and return it with the interventions (S, B, T).
+
+        `frequency` is the curriculum's probability of an intervention per step (trajectory forcing, section 3.3).
+        """
+        count, steps = self.adversarial.rollouts, self.context.steps
+        starts = self.experts.draw_each(count, self._generators("data"))
+        interventions = drawn(
+            self.generators, "curriculum", lambda g: draw_interventions(count, steps, frequency, g)
+        )
+        made = self.predictor.rollout(
+            starts.states[:, :, :1],
+            steps,
+            self._generators("policy"),
+            expert=starts.states,
+            interventions=interventions.to(self.device) if frequency > 0 else None,
+        )
+        return Batch(made.states, made.actions, starts.source), interventions
+
+    def update(self, latest: Batch, replay: Batch, *, actor_learns: bool = True) -> dict[str, Tensor]:
+        """Take adversarial.updates discriminator steps, then one SAC step (two time scales).
+
+        Returns mean losses, (S,) each.
+        """
+        logs = [self._update_discriminator(latest, replay) for _ in range(self.adversarial.updates)]
+        batch = self._actor_batch(replay)
+        steps = self._pick_steps(batch.actions.shape[2])
+        values = self.actor_critic.update(batch, steps, self.reward, actor_learns=actor_learns)
+        means = {name: sum(log[name] for log in logs) / len(logs) for name in logs[0]}
+        return means | {name: value.detach() for name, value in values.items()}
+
+    def _update_discriminator(self, latest: Batch, replay: Batch) -> dict[str, Tensor]:
+        # tau_G: fresh rollouts, and a share of past ones from the replay buffer. tau_E: the expert's.
+        b, data = self.training.batch, self._generators("data")
+        past = round(b * self.adversarial.past_share)
+        parts = [latest.draw_each(b - past, data)] if past < b else []
+        if past:
+            parts.append(replay.draw_each(past, data))
+        batches = [Batch.concatenate(parts), self.experts.draw_each(b, data)]
+        # tau_alpha and its labels (self-supervision).
+        labels: tuple[Tensor, ...] = ()
+        if self.supervision and self.label:
+            mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
+            batches.append(mixed)
+            labels = (torch.stack([self.label(part) for part in alpha]),)
+        # One pass of D over all parts at the same random time steps; its outputs are then split again (Eq. 3).
+        everything = Batch.concatenate(batches)
+        chosen = self._pick_steps(everything.actions.shape[2])
+        states = everything.states[:, :, :-1]
+        x = at_steps(self.features(states, states[:, :, 0]), chosen)
+        x = self._add_input_noise(x, states.shape[-1])
+        actions = self._add_input_noise(self.features.normalize_actions(at_steps(everything.actions, chosen)))
+        outputs = self.discriminator(x, actions).chunk(len(batches), dim=1)
+        loss, terms = self.objective.loss(*outputs, *labels)
+        # wail bounds D's slope by a gradient penalty, or by clipping its weights.
+        if self.wasserstein and self.wasserstein.constraint == "penalty":
+            (x_g, x_e), (a_g, a_e) = x.chunk(2, dim=1), actions.chunk(2, dim=1)
+            weight = drawn(self.generators, "data", lambda g: torch.rand(x_g.shape[1:3], generator=g)).to(self.device)
+            penalty = gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
+            terms["penalty"] = self.wasserstein.penalty * penalty
+            loss = loss + terms["penalty"]
+        self.optimizer.step(loss)
+        if self.wasserstein and self.wasserstein.constraint == "clipping":
+            with torch.no_grad():
+                for parameter in self.discriminator.parameters():
+                    parameter.clamp_(-self.wasserstein.clip, self.wasserstein.clip)
+        return {f"discriminator/{name}": value.detach() for name, value in {"loss": loss, **terms}.items()}
+
+    def _actor_batch(self, replay: Batch) -> Batch:
+        """Draw the actor-critic's batch from the replay buffers.
+
+        With self-supervision, tau_alpha replaces the first self_supervision.actor_share of tau_G: the dynamics are
+        affine, so an off-policy critic can learn from the mix (section 3.1.2).
+        """
+        generated = replay.draw_each(self.training.batch, self._generators("data"))
+        if not self.supervision:
+            return generated
+        first, others = generated.split(round(generated.count * self.supervision.actor_share))
+        mixed, _ = self._mixed(first, self.supervision, self.supervision.actor_pairing)
+        return Batch.concatenate([mixed, others])
+
+    def reward(self, x: Tensor, actions: Tensor) -> Tensor:
+        """Return the rewards (S, B, T, N) of features x (S, B, T, N, F) and actions (S, B, T, N, A)."""
+        return scaled_reward(self.adversarial, self.objective.reward(self.discriminator(x, actions)))
+
+    def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
+        """Return the expert trajectory with which to mix each generated one."""
+        if pairing == "start":
+            return self.experts[generated.source]
+        if pairing == "nearest":
+            return self.experts[torch.stack([nearest(made, self.experts.states) for made in generated.states])]
+        candidates = self.experts.draw_each(generated.count, self._generators("data")).of_each()
+        pairs = zip(generated.states, candidates, strict=True)
+        return Batch.of_seeds([found[assignment(made, found.states)] for made, found in pairs])
+
+    def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
+        """Mix a batch of tau_G with its expert partners: tau_alpha and alpha (S, B), section 3.1."""
+        pieces = supervision.alpha_pieces
+        alpha = drawn(self.generators, "alpha", lambda g: sample_alpha(generated.count, pieces, g)).to(self.device)
+        expert = self._pair(generated, pairing)
+        states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
+        return Batch(states, actions, generated.source), alpha
+
+    def _pick_steps(self, steps: int) -> Tensor:
+        """Draw the time steps (S, C) of an update in random order: all, or adversarial.time_steps of them."""
+        order = drawn(self.generators, "data", lambda g: torch.randperm(steps, generator=g))
+        return order[:, : self.adversarial.time_steps].to(self.device)
+
+    def _add_input_noise(self, inputs: Tensor, features: int | None = None) -> Tensor:
+        """Add Gaussian noise to the first `features` inputs (all by default), so that D ignores jitter."""
+        read, std = inputs[..., :features], self.adversarial.input_noise
+        if std == 0:
+            return inputs
+        noise = drawn(self.generators, "data", lambda g: torch.randn(read.shape[1:], generator=g)).to(self.device)
+        noisy = read + std * noise
+        return noisy if features is None else torch.cat([noisy, inputs[..., features:]], dim=-1)
+
+    def _generators(self, purpose: str) -> list[torch.Generator]:
+        return [generators[purpose] for generators in self.generators]

@@ -1,5 +1,6 @@
 """Trajectories as tensors: batches of them, and the replay buffer."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,9 @@ class Batch:
     states: (B, T + 1, N, D), positions and velocities.
     actions: (B, T, N, A), taken in states[:, :T].
     source: (B,), the index of the expert trajectory whose start each trajectory shares.
+
+    Batches of S seeds side by side have an axis S in front; `of_seeds` and `draw_each` make them, and `concatenate`
+    joins them.
     """
 
     states: Tensor
@@ -49,10 +53,40 @@ class Batch:
         """Draw `count` trajectories uniformly with replacement."""
         return self[torch.randint(len(self), (count,), generator=generator).to(self.states.device)]
 
+    @property
+    def count(self) -> int:
+        """B."""
+        return self.source.shape[-1]
+
+    def draw_each(self, count: int, generators: "Sequence[torch.Generator]") -> "Batch":
+        """Draw `count` trajectories for each of S seeds, from its part of this batch or from what all seeds share."""
+        drawn = torch.stack([torch.randint(self.count, (count,), generator=g) for g in generators])
+        drawn = drawn.to(self.states.device)
+        if self.source.dim() == 1:
+            return self[drawn]
+        seeds = torch.arange(len(generators), device=drawn.device).unsqueeze(1)
+        return Batch(self.states[seeds, drawn], self.actions[seeds, drawn], self.source[seeds, drawn])
+
+    def split(self, count: int) -> "tuple[Batch, Batch]":
+        """Return the first `count` trajectories and the others, of every seed."""
+        parts = zip(*(x.split([count, self.count - count], self.source.dim() - 1) for x in vars(self).values()), strict=True)
+        first, others = (Batch(*part) for part in parts)
+        return first, others
+
+    def of_each(self) -> "list[Batch]":
+        """Return the batch of each seed."""
+        return [Batch(*part) for part in zip(self.states, self.actions, self.source, strict=True)]
+
     @staticmethod
-    def concatenate(parts: "list[Batch]") -> "Batch":
+    def of_seeds(batches: "Sequence[Batch]") -> "Batch":
+        """Put the batches of S seeds side by side."""
+        return Batch(*(torch.stack([getattr(p, f) for p in batches]) for f in ("states", "actions", "source")))
+
+    @staticmethod
+    def concatenate(parts: "Sequence[Batch]") -> "Batch":
         """Join batches along the batch axis."""
-        return Batch(*(torch.cat([getattr(p, f) for p in parts]) for f in ("states", "actions", "source")))
+        axis = parts[0].source.dim() - 1
+        return Batch(*(torch.cat([getattr(p, f) for p in parts], axis) for f in ("states", "actions", "source")))
 
 
 class ReplayBuffer:

@@ -5,7 +5,7 @@ The loop returns metrics and does not know where they are stored.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -84,16 +84,38 @@ class TrainingLoop:
         Raises Divergence if a weight is not finite. The order of the steps is part of a run's numbers: a checkpoint
         taken after the call continues as if never interrupted.
         """
+        (outcome,) = self.run_epochs([self])
+        if isinstance(outcome, Divergence):
+            raise outcome
+        return outcome
+
+    @staticmethod
+    def run_epochs(loops: "Sequence[TrainingLoop]") -> "list[dict[str, float] | Divergence]":
+        """Train and validate seeds of one spec, all before the same epoch, for one epoch.
+
+        Returns, for each, what `run_epoch` of the seed alone would return or raise.
+        """
         began = time.perf_counter()
-        # 1. Train. 2. Validate, drawing from the evaluation generator.
-        values = self.learner.run_epoch(self.epoch)
-        self._check_finite()
+        first = loops[0].learner
+        if isinstance(first, AdversarialLearner):
+            trained = first.run_epochs([loop.learner for loop in loops], loops[0].epoch)
+        else:
+            trained = [loop.learner.run_epoch(loop.epoch) for loop in loops]
+        share = (time.perf_counter() - began) / len(loops)
+        return [loop._after_training(values, share) for loop, values in zip(loops, trained, strict=True)]
+
+    def _after_training(self, values: dict[str, float], seconds: float) -> "dict[str, float] | Divergence":
+        """Validate after an epoch of training that took `seconds`, and return all metrics of the epoch."""
+        began = time.perf_counter()
+        if not self._is_finite():
+            return Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
+        # 1. Validate, drawing from the evaluation generator. 2. Count the epoch and compare it with the best one.
         values |= self.evaluator.epoch(self.learner.predictor)
-        # 3. Count the epoch and compare it with the best one. 4. Record a landscape, with its own generator.
         self.epoch += 1
         self._select(*self.evaluator.rank(values))
+        # 3. Record a landscape, with its own generator.
         values |= self._record_landscape()
-        return values | {"seconds": time.perf_counter() - began}
+        return values | {"seconds": seconds + time.perf_counter() - began}
 
     def _record_landscape(self) -> dict[str, float]:
         """Put this epoch's landscape into `snapshot` and return its metrics, if the spec asks for one."""
@@ -110,7 +132,7 @@ class TrainingLoop:
             self.best = self._as_best(flawed, error)
 
     def _as_best(self, flawed: bool, error: float) -> dict[str, Any]:
-        weights = deepcopy(self.learner.predictor.model.state_dict())
+        weights = {name: value.clone() for name, value in self.learner.predictor.model.state_dict().items()}
         return {"flawed": flawed, "error": error, "epoch": self.epoch, "weights": weights}
 
     def final_evaluation(self) -> tuple[dict[str, float], Arrays]:
@@ -149,10 +171,6 @@ class TrainingLoop:
     def best_state_dict(self) -> dict[str, Any]:
         """Return the weights with the best validation error so far, with their epoch and error."""
         return {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
-
-    def _check_finite(self) -> None:
-        if not self._is_finite():
-            raise Divergence(f"weights became NaN or infinite in epoch {self.epoch + 1}")
 
     def _is_finite(self) -> bool:
         parameters = (p for network in self.learner.networks() for p in network.parameters())

@@ -1,5 +1,6 @@
 """Rollouts of a graph policy in the trajectory environment."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Unpack
 
@@ -55,7 +56,7 @@ class PolicyPredictor:
         self,
         observed: Tensor,
         steps: int,
-        generator: torch.Generator,
+        generator: torch.Generator | Sequence[torch.Generator],
         *,
         expert: Tensor | None = None,
         interventions: Tensor | None = None,
@@ -67,39 +68,43 @@ class PolicyPredictor:
         The graph encoder reads the earlier observed states first. At steps where `interventions` (B, T) is set, the
         group is moved to the state of `expert` (B, T, N, D) before it acts. `deterministic` takes the mean action; the
         graph is sampled in any case. `noise` (B, H + T - 1, N, D) is added to every state that the policy reads; the
-        environment's state stays clean.
+        environment's state stays clean. With the weights of S seeds, all of this has another axis S in front, and
+        there is one generator per seed.
         """
-        policy, (b, h, n, _) = self.model, observed.shape
+        policy, (*lead, h, n, _) = self.model, observed.shape
+        b, a = lead[-1], policy.action_size
         # Draw all noise up front.
-        graph_noise = policy.draw_graph_noise(b, steps, n, generator).to(observed.device)
-        action_noise = torch.randn(steps, b, 1, n, policy.action_size, generator=generator).to(observed.device)
+        graph_noise = _drawn(generator, lambda g: policy.draw_graph_noise(b, steps, n, g)).to(observed.device)
+        action_noise = _drawn(generator, lambda g: torch.randn(steps, b, 1, n, a, generator=g)).to(observed.device)
+        action_noise = action_noise.movedim(-5, 0)  # (T, B, 1, N, A)
         if deterministic:
             action_noise = torch.zeros_like(action_noise)
         if noise is None:
             noise = observed.new_zeros(1, h + steps - 1, 1, 1)
-        start = observed[:, 0] + noise[:, 0]
+        start = observed[..., 0, :, :] + noise[..., 0, :, :]
         # Warm up the encoder's memory on the observed history.
         memory: Memory | None = None
         for first in range(0, h - 1, ENCODER_CHUNK):
             part = slice(first, min(first + ENCODER_CHUNK, h - 1))
-            _, memory = policy.encoder(self.features(observed[:, part] + noise[:, part], start, first), memory)
-        state = observed[:, -1:]
+            read = observed[..., part, :, :] + noise[..., part, :, :]
+            _, memory = policy.encoder(self.features(read, start, first), memory)
+        state = observed[..., -1:, :, :]
         states, actions = [], []
         for t in range(steps):
             # Curriculum: put the group back on the expert's track.
             if interventions is not None and expert is not None:
-                state = torch.where(interventions[:, t].view(b, 1, 1, 1), expert[:, t : t + 1], state)
+                state = torch.where(interventions[..., t].view(*lead, 1, 1, 1), expert[..., t : t + 1, :, :], state)
             # Policy: read the state, infer the graph, act.
-            read = state + noise[:, h - 1 + t : h + t]
+            read = state + noise[..., h - 1 + t : h + t, :, :]
             x = self.features(read, start, h - 1 + t)
-            at = t if graph_noise.shape[1] > 1 else 0
-            graph, _, memory = policy.graphs(x, graph_noise[:, at : at + 1], memory)
-            action = policy.actor.sample(x, graph, read[..., policy.action_size :], action_noise[t])
+            at = t if graph_noise.shape[-4] > 1 else 0
+            graph, _, memory = policy.graphs(x, graph_noise[..., at : at + 1, :, :, :], memory)
+            action = policy.actor.sample(x, graph, read[..., a:], action_noise[t])
             states.append(state)
             actions.append(action)
             # Environment.
             state = self.integrator.step(state, action)
-        return Rollout(torch.cat([*states, state], dim=1), torch.cat(actions, dim=1))
+        return Rollout(torch.cat([*states, state], dim=-3), torch.cat(actions, dim=-3))
 
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor."""
@@ -116,3 +121,8 @@ class PolicyPredictor:
         a = self.model.action_size
         no_noise = torch.zeros(b, t, n, a, device=now.device)
         return self.integrator.step(now, self.model.actor.sample(x, graphs, now[..., a:], no_noise))
+
+
+def _drawn(generator: torch.Generator | Sequence[torch.Generator], draw: Callable[[torch.Generator], Tensor]) -> Tensor:
+    """Return the draw of a generator, or those of several side by side."""
+    return draw(generator) if isinstance(generator, torch.Generator) else torch.stack([draw(g) for g in generator])

@@ -1,9 +1,11 @@
 """Independent random generators from one seed: changing one use of randomness leaves the others as they were."""
 
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ssmail.training.checkpoint import entries, fitted_generator
 
@@ -33,3 +35,8 @@ class Generators:
         state = entries(state, self.by_purpose, "generators")
         for purpose, generator in self.by_purpose.items():
             generator.set_state(fitted_generator(state[purpose], generator, f"generators.{purpose}"))
+
+
+def drawn(seeds: Sequence[Generators], purpose: str, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
+    """Return the draws (...) from each seed's generator of that purpose, side by side: (S, ...)."""
+    return torch.stack([draw(seed[purpose]) for seed in seeds])
