@@ -6,6 +6,7 @@ import select
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,16 @@ class Walk:
         if self.improved:
             self.best_error, self.best_place = error, self.place
         return {"validation/mode_mse": error, "actor/loss": math.nan if self.epoch == 2 else float(self.place[0])}
+
+    @staticmethod
+    def run_epochs(loops: "Sequence[Walk]") -> "list[dict[str, float] | Exception]":
+        outcomes: list[dict[str, float] | Exception] = []
+        for loop in loops:
+            try:
+                outcomes.append(loop.run_epoch())
+            except Exception as error:
+                outcomes.append(error)
+        return outcomes
 
     def state_dict(self) -> dict[str, Any]:
         best = {"error": self.best_error, "place": self.best_place}

@@ -46,13 +46,15 @@ class Event:
         return self.kind in _FINAL
 
     def as_line(self) -> str:
-        """Return the event without its cell as one line of JSON."""
-        return json.dumps({name: value for name, value in vars(self).items() if name != "cell"}, default=dict)
+        """Return the event, with its seed instead of its cell, as one line of JSON."""
+        parts = {name: value for name, value in vars(self).items() if name != "cell"}
+        return json.dumps({"seed": self.cell.seed, **parts}, default=dict)
 
     @classmethod
-    def from_line(cls, line: str | bytes, cell: Cell) -> Self:
-        """Return the event of `cell` that `as_line` wrote."""
-        return cls(cell=cell, **json.loads(line))
+    def from_line(cls, line: str | bytes, spec: RunSpec) -> Self:
+        """Return the event that `as_line` wrote of a cell with this spec."""
+        parts = json.loads(line)
+        return cls(cell=Cell(spec, parts.pop("seed")), **parts)
 
 
 @dataclass(frozen=True)
@@ -66,20 +68,26 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Job:
-    """Everything that a worker process needs to compute one cell."""
+    """Everything that a worker process needs to compute cells of one spec."""
 
-    cell: Cell
+    spec: RunSpec
+    seeds: tuple[int, ...]
     store_url: str
     settings: RunSettings
 
     def as_line(self) -> str:
         """Return the job as one line of JSON."""
-        parts: dict[str, Any] = {"seed": self.cell.seed, "store_url": self.store_url, "settings": asdict(self.settings)}
-        return json.dumps({**parts, "spec": json.loads(self.cell.spec.as_json())})
+        parts: dict[str, Any] = {"seeds": self.seeds, "store_url": self.store_url, "settings": asdict(self.settings)}
+        return json.dumps({**parts, "spec": json.loads(self.spec.as_json())})
 
     @classmethod
     def from_line(cls, line: str | bytes) -> Self:
         """Return the job that `as_line` wrote."""
         parts = json.loads(line)
         settings = RunSettings(**{**parts["settings"], "resume": Resume(parts["settings"]["resume"])})
-        return cls(Cell(RunSpec.model_validate(parts["spec"]), parts["seed"]), parts["store_url"], settings)
+        return cls(RunSpec.model_validate(parts["spec"]), tuple(parts["seeds"]), parts["store_url"], settings)
+
+    @property
+    def cells(self) -> list[Cell]:
+        """The cells to compute."""
+        return [Cell(self.spec, seed) for seed in self.seeds]

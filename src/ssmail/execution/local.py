@@ -1,4 +1,7 @@
-"""Computes cells on this machine, each in a worker process with one thread, several at a time."""
+"""Computes cells on this machine in worker processes of one thread each, several at a time.
+
+Seeds of one spec whose method can train them together share a process, which takes a fraction of the time.
+"""
 
 import os
 import selectors
@@ -11,12 +14,13 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import NO_LONGER_STORED, Cell, Event, Job, Kind, RunSettings
-from ssmail.execution.planning import check_labels, plan_cell
+from ssmail.execution.planning import check_labels, plan_cell, shares
 from ssmail.store import HEARTBEAT_SECONDS, RunRow, RunState, Store
 
 WORKER = (sys.executable, "-P", "-m", "ssmail.execution.worker")
@@ -36,9 +40,12 @@ def run_cells(
     jobs: int = 1,
     device: str = "cpu",
     resume: Resume = Resume.AUTO,
+    together: bool = True,
     worker: Sequence[str] = WORKER,
 ) -> list[Event]:
-    """Compute every cell, at most `jobs` at a time, and return the final event of each, in the order of `cells`.
+    """Compute every cell in at most `jobs` processes, and return the final event of each, in the order of `cells`.
+
+    With `together`, a process trains several seeds of a spec at once where their method can (`planning.shares`).
 
     `on_event` is called in this process with every event, including final ones. A failing cell does not affect the
     others. After SIGINT or SIGTERM to this process, every running cell finishes its epoch and is marked interrupted; a
@@ -51,14 +58,16 @@ def run_cells(
     try:
         plans = [plan_cell(store, cell, resume) for cell in cells]
         pool = _Pool(store, RunSettings(device, resume), jobs, on_event, worker)
-        for index, (cell, plan) in enumerate(zip(cells, plans, strict=True)):
+        waiting = []
+        for cell, plan in zip(cells, plans, strict=True):
             if plan.skipped is not None:
-                pool.emit(index, plan.skipped)
+                pool.emit(plan.skipped)
             else:
-                pool.waiting.append((index, cell))
+                waiting.append(cell)
+        pool.waiting = shares(waiting, jobs) if together else [[cell] for cell in waiting]
         with _counted_signals(pool):
             pool.run()
-        return [pool.results[index] for index in range(len(cells))]
+        return [pool.results[cell] for cell in cells]
     finally:
         store.close()
 
@@ -88,11 +97,11 @@ def wait_for_others(
 
 
 class _Worker:
-    """A worker process and its last event."""
+    """A worker process and the last event of each of its cells."""
 
-    def __init__(self, index: int, job: Job, command: Sequence[str]) -> None:
-        self.index, self.cell = index, job.cell
-        self.last = Event("started", job.cell, None, 0, job.cell.spec.epochs)
+    def __init__(self, job: Job, command: Sequence[str]) -> None:
+        self.spec = job.spec
+        self.last = {cell: Event("started", cell, None, 0, job.spec.epochs) for cell in job.cells}
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `wait`)
         self._buffer = b""
         self.process = subprocess.Popen(
@@ -114,8 +123,8 @@ class _Worker:
         """Return the events that have arrived; None once the process has closed its output."""
         data = os.read(self.stdout.fileno(), 65536)
         *lines, self._buffer = (self._buffer + data).split(b"\n")
-        events = [Event.from_line(line, self.cell) for line in lines]
-        self.last = events[-1] if events else self.last
+        events = [Event.from_line(line, self.spec) for line in lines]
+        self.last |= {event.cell: event for event in events}
         return events if data else None
 
     def ask_to_stop(self) -> None:
@@ -145,8 +154,8 @@ class _Pool:
         on_event: Callable[[Event], None],
         command: Sequence[str],
     ) -> None:
-        self.waiting: list[tuple[int, Cell]] = []
-        self.results: dict[int, Event] = {}
+        self.waiting: list[list[Cell]] = []
+        self.results: dict[Cell, Event] = {}
         self.stop_signals = 0
         self._store, self._settings, self._jobs, self._on_event = store, settings, jobs, on_event
         self._command = command
@@ -154,10 +163,10 @@ class _Pool:
         self._selector = selectors.DefaultSelector()
         self._any_started = False
 
-    def emit(self, index: int, event: Event) -> None:
+    def emit(self, event: Event) -> None:
         """Pass an event to `on_event`, and keep it if it is final."""
         if event.is_final:
-            self.results[index] = event
+            self.results[event.cell] = event
         self._any_started = self._any_started or event.kind in ("started", "resumed")
         self._on_event(event)
 
@@ -178,8 +187,9 @@ class _Pool:
 
     def _start_workers(self) -> None:
         while self.waiting and len(self._workers) < self._jobs and not self.stop_signals:
-            index, cell = self.waiting.pop(0)
-            worker = _Worker(index, Job(cell, self._store.url, self._settings), self._command)
+            cells = self.waiting.pop(0)
+            seeds = tuple(cell.seed for cell in cells)
+            worker = _Worker(Job(cells[0].spec, seeds, self._store.url, self._settings), self._command)
             self._workers.append(worker)
             self._selector.register(worker.stdout, selectors.EVENT_READ, worker)
 
@@ -190,28 +200,29 @@ class _Pool:
                 raise InputError(event.message)
             if event.kind in ("finished", "diverged") and not self._store.still_stored([str(event.run_id)]):
                 event = replace(event, kind="failed", message=NO_LONGER_STORED)
-            self.emit(worker.index, event)
+            self.emit(event)
         if events is None:
             self._selector.unregister(worker.stdout)
             self._workers.remove(worker)
             ended = worker.wait()
-            if not worker.last.is_final:
-                self._report_dead_worker(worker, ended)
+            for last in worker.last.values():
+                if not last.is_final:
+                    self._report_dead_run(last, ended)
 
-    def _report_dead_worker(self, worker: _Worker, ended: str) -> None:
-        last, stopped = worker.last, self.stop_signals > 0
+    def _report_dead_run(self, last: Event, ended: str) -> None:
+        stopped = self.stop_signals > 0
         if last.run_id is not None:
             with suppress(SsmailError):  # the database may be gone, too
                 self._store.end_dead_run(last.run_id, RunState.INTERRUPTED if stopped else RunState.FAILED, ended)
         kind: Kind = "interrupted" if stopped else "failed"
-        self.emit(worker.index, Event(kind, worker.cell, last.run_id, last.epoch, last.epochs, message=ended))
+        self.emit(Event(kind, last.cell, last.run_id, last.epoch, last.epochs, message=ended))
 
     def _handle_signals(self) -> None:
         if not self.stop_signals:
             return
-        for index, cell in self.waiting:
+        for cell in chain.from_iterable(self.waiting):
             epochs = cell.spec.epochs
-            self.emit(index, Event("interrupted", cell, None, 0, epochs, message="stopped before it started"))
+            self.emit(Event("interrupted", cell, None, 0, epochs, message="stopped before it started"))
         self.waiting.clear()
         for worker in self._workers:
             worker.ask_to_stop()

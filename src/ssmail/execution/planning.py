@@ -1,5 +1,6 @@
 """Planning before cells are computed: check them, decide what to do with each, estimate how long they take."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,31 @@ def _check_data(cell: Cell, row: RunRow) -> None:
     path = cell.spec.data.path
     if path is not None and load(Path(path), cell.spec.environment).hash != row.dataset_hash:
         raise InputError(f"{path} has changed since run {row.name} was trained on it; train again with --resume never")
+
+
+def shares(cells: Sequence[Cell], jobs: int) -> list[list[Cell]]:
+    """Divide cells into those that one process each trains, in the order of their first cells.
+
+    The seeds of a spec whose method can train several at once are divided evenly among `jobs` processes; all other
+    cells have a process of their own.
+    """
+    by_spec: dict[RunSpec, list[Cell]] = {}
+    for cell in cells:
+        by_spec.setdefault(cell.spec, []).append(cell)
+    divided = []
+    for spec, own in by_spec.items():
+        size = math.ceil(len(own) / jobs) if _trains_together(spec) else 1
+        divided += [own[first : first + size] for first in range(0, len(own), size)]
+    return divided
+
+
+def _trains_together(spec: RunSpec) -> bool:
+    """Whether a process can train several seeds of the spec at once: small networks of an adversarial method.
+
+    With sac.encoder_steps, every seed has a window of its own; and the many edges of recorded motion leave nothing to
+    gain.
+    """
+    return spec.adversarial is not None and spec.sac is not None and spec.sac.encoder_steps is None
 
 
 def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[RunSpec, float | None]:

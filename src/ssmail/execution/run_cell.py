@@ -1,11 +1,12 @@
-"""Computes one cell in this process: trains, stores metrics and checkpoints, and resumes an unfinished run."""
+"""Computes cells in this process: trains, stores metrics and checkpoints, and resumes unfinished runs."""
 
 import os
 import threading
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
+from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ import torch
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
-from ssmail.execution.cells import Cell, Event, RunSettings
+from ssmail.execution.cells import Cell, Event, Kind, RunSettings
 from ssmail.execution.planning import BEST, LAST, LASTS, Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
 from ssmail.store.checkpoint_files import run_folder
@@ -22,7 +23,7 @@ from ssmail.training.loop import Divergence, TrainingLoop
 
 
 class Loop(Protocol):
-    """The part of TrainingLoop that `run_cell` uses. Tests substitute simple loops."""
+    """The part of TrainingLoop that `run_together` uses. Tests substitute simple loops."""
 
     epoch: int  # completed epochs
     dataset_hash: str
@@ -31,6 +32,10 @@ class Loop(Protocol):
 
     def run_epoch(self) -> dict[str, float]:
         """Train one epoch and return its metrics. Raises Divergence."""
+
+    @staticmethod
+    def run_epochs(loops: Sequence[Self]) -> Sequence[dict[str, float] | Exception]:
+        """Train one epoch of each loop, all before the same epoch; return what `run_epoch` would return or raise."""
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Return the final metrics and arrays."""
@@ -57,14 +62,52 @@ def run_cell(
     should_stop: Callable[[], bool],
     make_loop: MakeLoop = TrainingLoop,
 ) -> Event:
-    """Compute the cell and return its final event; pass all earlier events to `on_event`.
+    """Compute one cell as `run_together` does; return its final event and pass all earlier ones to `on_event`."""
+    events: list[Event] = []
 
-    `should_stop` is called between epochs. Once it returns True, the run is marked interrupted; resuming it gives the
-    same numbers as an uninterrupted run. Exceptions become a "failed" event, with the traceback in the run's `error`.
+    def keep(event: Event) -> None:
+        (events.append if event.is_final else on_event)(event)
+
+    run_together([cell], store, settings, keep, should_stop, make_loop)
+    (final,) = events
+    return final
+
+
+def run_together(
+    cells: Sequence[Cell],
+    store: Store,
+    settings: RunSettings,
+    on_event: Callable[[Event], None],
+    should_stop: Callable[[], bool],
+    make_loop: MakeLoop = TrainingLoop,
+) -> None:
+    """Compute seeds of one spec, epoch by epoch, all at once; pass every event to `on_event`, also the final ones.
+
+    A seed ends by itself: its divergence or failure does not affect the others. Seeds that were interrupted at
+    different epochs catch up first. `should_stop` is called between epochs. Once it returns True, the runs are marked
+    interrupted; resuming them gives the same numbers as an uninterrupted run. Exceptions become "failed" events, with
+    the traceback in the run's `error`.
     """
-    epochs = cell.spec.epochs
     if should_stop():
-        return Event("interrupted", cell, None, 0, epochs, message="stopped before it started")
+        for cell in cells:
+            on_event(Event("interrupted", cell, None, 0, cell.spec.epochs, message="stopped before it started"))
+        return
+    runs = []
+    for cell in cells:
+        started = _start(cell, store, settings, make_loop)
+        if isinstance(started, Event):
+            on_event(started)
+        else:
+            runs.append(started)
+            on_event(started.event("resumed" if started.resumed else "started"))
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(_heartbeats(run.writer, settings.heartbeat_seconds))
+        _train([run for run in runs if run.attempt(run.record_snapshot, on_event)], on_event, should_stop)
+
+
+def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop) -> "_Run | Event":
+    """Start or resume the run of a cell, or return its final event if there is nothing to train."""
     try:
         plan = plan_cell(store, cell, settings.resume)
         if plan.skipped is not None:
@@ -73,17 +116,10 @@ def run_cell(
             raise InputError("PyTorch finds no CUDA device on this machine; use --device cpu")
         loop = make_loop(cell.spec, cell.seed, settings.device)
         writer = _open_run(cell, store, settings, plan, loop)
+        return _Run(cell, loop, writer, resumed=plan.row is not None)
     except Exception as error:
         bad_input = isinstance(error, InputError)
-        return Event("failed", cell, None, 0, epochs, message=_summary(error), bad_input=bad_input)
-    on_event(Event("resumed" if plan.row else "started", cell, writer.run_id, loop.epoch, epochs))
-    with _heartbeats(writer, settings.heartbeat_seconds):
-        try:
-            return _train(cell, loop, writer, on_event, should_stop)
-        except Exception as error:
-            with suppress(SsmailError):  # if writing to the store fails too, report the first error
-                writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(traceback.format_exc())}")
-            return Event("failed", cell, writer.run_id, loop.epoch, epochs, message=_summary(error))
+        return Event("failed", cell, None, 0, cell.spec.epochs, message=_summary(error), bad_input=bad_input)
 
 
 def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop: Loop) -> RunWriter:
@@ -117,58 +153,114 @@ def _load_last(store: Store, run_id: str, loop: Loop) -> None:
         raise InputError(f"the checkpoint {last} does not fit its run ({error}); {AFRESH}") from error
 
 
-def _train(
-    cell: Cell,
-    loop: Loop,
-    writer: RunWriter,
-    on_event: Callable[[Event], None],
-    should_stop: Callable[[], bool],
-) -> Event:
+class _Run:
+    """A run in progress: a loop and what is stored of it."""
+
     # Each epoch is written in this order: metrics, arrays, checkpoint, and the checkpoint's record. So a recorded
     # checkpoint is never ahead of the database, and what a killed process stored after it is computed again, to the
     # same bits. Two files take turns: the recorded one stays until the next one has a record.
-    epochs = cell.spec.epochs
-    if loop.snapshot:
-        writer.arrays(loop.snapshot)
-    while loop.epoch < epochs:
-        if should_stop():
-            writer.finish(RunState.INTERRUPTED, f"stopped after epoch {loop.epoch}")
-            return Event("interrupted", cell, writer.run_id, loop.epoch, epochs)
+
+    def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool) -> None:
+        self.cell, self.loop, self.writer, self.resumed = cell, loop, writer, resumed
+        self.epochs = cell.spec.epochs
+
+    def event(self, kind: Kind, metrics: Mapping[str, float] | None = None, message: str = "") -> Event:
+        return Event(kind, self.cell, self.writer.run_id, self.loop.epoch, self.epochs, metrics or {}, message)
+
+    def attempt(self, work: Callable[[], Event | None], on_event: Callable[[Event], None]) -> bool:
+        """Do a part of the run's work and report its event; return whether the run goes on."""
         try:
-            metrics = loop.run_epoch()
-        except Divergence as error:
-            _record_checkpoints(writer, _last_name(epochs, loop.epoch))
-            writer.finish(RunState.DIVERGED, str(error))
-            return Event("diverged", cell, writer.run_id, loop.epoch, epochs, message=str(error))
-        writer.epoch(loop.epoch, metrics)
-        if loop.snapshot:
-            writer.arrays(loop.snapshot)
-        if loop.improved:
-            save_checkpoint(writer.folder / BEST, loop.best_state_dict())
-        last = _last_name(epochs, loop.epoch)
-        save_checkpoint(writer.folder / last, loop.state_dict())
-        writer.artifact(LAST, last)
-        on_event(Event("epoch", cell, writer.run_id, loop.epoch, epochs, metrics))
-    metrics, arrays = loop.final_evaluation()
-    writer.final(loop.epoch, metrics)
-    writer.arrays(arrays)
-    _record_checkpoints(writer, LAST)
-    writer.finish(RunState.FINISHED)
-    return Event("finished", cell, writer.run_id, loop.epoch, epochs, metrics)
+            event = work()
+        except Exception as error:
+            event = self.fail(error)
+        if event is not None:
+            on_event(event)
+        return event is None or not event.is_final
+
+    def record_snapshot(self) -> None:
+        if self.loop.snapshot:
+            self.writer.arrays(self.loop.snapshot)
+
+    def record_epoch(self, outcome: Mapping[str, float] | Exception) -> Event:
+        """Store an epoch that has been trained, or how it ended the run."""
+        if isinstance(outcome, Exception) and not isinstance(outcome, Divergence):
+            return self.fail(outcome)
+        if isinstance(outcome, Divergence):
+            self._record_checkpoints(self._last_name())
+            self.writer.finish(RunState.DIVERGED, str(outcome))
+            return self.event("diverged", message=str(outcome))
+        self.writer.epoch(self.loop.epoch, outcome)
+        self.record_snapshot()
+        if self.loop.improved:
+            save_checkpoint(self.writer.folder / BEST, self.loop.best_state_dict())
+        last = self._last_name()
+        save_checkpoint(self.writer.folder / last, self.loop.state_dict())
+        self.writer.artifact(LAST, last)
+        return self.event("epoch", outcome)
+
+    def evaluate(self) -> Event:
+        """Store the final evaluation and end the run."""
+        metrics, arrays = self.loop.final_evaluation()
+        self.writer.final(self.loop.epoch, metrics)
+        self.writer.arrays(arrays)
+        self._record_checkpoints(LAST)
+        self.writer.finish(RunState.FINISHED)
+        return self.event("finished", metrics)
+
+    def interrupt(self) -> Event:
+        self.writer.finish(RunState.INTERRUPTED, f"stopped after epoch {self.loop.epoch}")
+        return self.event("interrupted")
+
+    def fail(self, error: Exception) -> Event:
+        with suppress(SsmailError):  # if writing to the store fails too, report the first error
+            trace = "".join(traceback.format_exception(error))
+            self.writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(trace)}")
+        return self.event("failed", message=_summary(error))
+
+    def _last_name(self) -> str:
+        """Return the name of the checkpoint file of this epoch; that of the final one is LAST."""
+        return LASTS[(self.epochs - self.loop.epoch) % 2]
+
+    def _record_checkpoints(self, last: str) -> None:
+        """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left."""
+        folder = self.writer.folder
+        for name, file in ((BEST, BEST), (LAST, last)):
+            if (folder / file).exists():
+                self.writer.artifact(name, file)
+        for stray in (*folder.glob(".*.partial"), *(folder / name for name in LASTS if name != last)):
+            stray.unlink(missing_ok=True)
 
 
-def _last_name(epochs: int, epoch: int) -> str:
-    """Return the name of the checkpoint file of an epoch; that of the final one is LAST."""
-    return LASTS[(epochs - epoch) % 2]
+def _train(runs: Sequence[_Run], on_event: Callable[[Event], None], should_stop: Callable[[], bool]) -> None:
+    """Train the runs to their end, always those that are the least far."""
+    while runs:
+        for run in runs:
+            run.writer.share(len(runs))
+        runs = [
+            run for run in runs if run.loop.epoch < run.epochs or run.attempt(run.evaluate, on_event)
+        ]
+        if not runs:
+            return
+        if should_stop():
+            for run in runs:
+                run.attempt(run.interrupt, on_event)
+            return
+        epoch = min(run.loop.epoch for run in runs)
+        behind = [run for run in runs if run.loop.epoch == epoch]
+        ended = [
+            run
+            for run, outcome in zip(behind, _outcomes([run.loop for run in behind]), strict=True)
+            if not run.attempt(partial(run.record_epoch, outcome), on_event)
+        ]
+        runs = [run for run in runs if run not in ended]
 
 
-def _record_checkpoints(writer: RunWriter, last: str) -> None:
-    """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left there."""
-    for name, file in ((BEST, BEST), (LAST, last)):
-        if (writer.folder / file).exists():
-            writer.artifact(name, file)
-    for stray in (*writer.folder.glob(".*.partial"), *(writer.folder / name for name in LASTS if name != last)):
-        stray.unlink(missing_ok=True)
+def _outcomes(loops: Sequence[Loop]) -> Sequence[Mapping[str, float] | Exception]:
+    """Train each loop for an epoch; return its metrics, or the exception that ended it."""
+    try:
+        return [loops[0].run_epoch()] if len(loops) == 1 else type(loops[0]).run_epochs(loops)
+    except Exception as error:
+        return [error] * len(loops)
 
 
 @contextmanager

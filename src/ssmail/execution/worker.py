@@ -1,4 +1,4 @@
-"""The worker process of `ssmail.execution.local`: reads a job from stdin, computes its cell, writes events to stdout.
+"""The worker process of `ssmail.execution.local`: reads a job from stdin, computes its cells, writes events to stdout.
 
 It stops after the current epoch when stdin ends. That happens when the parent closes it, but also when the parent dies
 for any reason, so that no worker goes on training.
@@ -16,7 +16,7 @@ _STDIN, _STDOUT, _STDERR = 0, 1, 2
 
 
 def main(make_loop: "MakeLoop | None" = None) -> None:
-    """Compute the cell of the job on stdin with `make_loop`, by default TrainingLoop."""
+    """Compute the cells of the job on stdin with `make_loop`, by default TrainingLoop."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -28,7 +28,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
     import torch  # imported late: it takes seconds, in which the signals above must be handled already
 
     from ssmail.execution.cells import Event, Job
-    from ssmail.execution.run_cell import run_cell
+    from ssmail.execution.run_cell import run_together
     from ssmail.store import Store
     from ssmail.training.loop import TrainingLoop
 
@@ -41,7 +41,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
     torch.set_num_threads(1)
     job = Job.from_line(line)
     store = Store.open(job.store_url)
-    send(run_cell(job.cell, store, job.settings, send, stop.is_set, make_loop or TrainingLoop))
+    run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop)
 
 
 def _read_line() -> bytes:

@@ -38,9 +38,9 @@ class RunWriter:
         self._engine = engine
         self.folder = run_folder(checkpoint_root, run_id)
         self._owner = owner
-        # clock readings at which this run's wall and CPU time would have been zero
-        self._wall_start = time.monotonic() - (resumed.wall_seconds if resumed else 0.0)
-        self._cpu_start = time.process_time() - (resumed.cpu_seconds if resumed else 0.0)
+        # wall and CPU time up to a clock reading; what has passed since then is shared among so many runs
+        self._used = (resumed.wall_seconds, resumed.cpu_seconds) if resumed else (0.0, 0.0)
+        self._since, self._runs = (time.monotonic(), time.process_time()), 1
         self._peak_memory_before = (resumed and resumed.peak_memory_bytes) or 0
 
     def epoch(self, step: int, metrics: Mapping[str, float]) -> None:
@@ -60,6 +60,10 @@ class RunWriter:
             _delete(connection, schema.metric, self.run_id, list(metrics))
             _insert(connection, schema.metric, self.run_id, step, metrics)
             self._replace_latest(connection, step, metrics)
+
+    def share(self, runs: int) -> None:
+        """From now on, count time as that of `runs` runs which this process trains at once."""
+        self._used, self._since, self._runs = self._seconds(), (time.monotonic(), time.process_time()), runs
 
     def heartbeat(self) -> None:
         """Record that this run is alive. Safe to call from another thread."""
@@ -98,10 +102,16 @@ class RunWriter:
             raise SsmailError(f"run {self.run_id[:8]} was resumed by another process, which now owns it")
         raise SsmailError(f"run {self.run_id[:8]} is {state} and can no longer be written")
 
+    def _seconds(self) -> tuple[float, float]:
+        """Return this run's wall and CPU time so far."""
+        wall, cpu = time.monotonic() - self._since[0], time.process_time() - self._since[1]
+        return self._used[0] + wall / self._runs, self._used[1] + cpu / self._runs
+
     def _resources(self) -> dict[str, Any]:
+        wall, cpu = self._seconds()
         return {
-            "wall_seconds": time.monotonic() - self._wall_start,
-            "cpu_seconds": time.process_time() - self._cpu_start,
+            "wall_seconds": wall,
+            "cpu_seconds": cpu,
             "peak_memory_bytes": max(self._peak_memory_before, run_metadata.peak_memory_bytes()),
         }
 

@@ -85,12 +85,12 @@ class TrainingLoop:
         taken after the call continues as if never interrupted.
         """
         (outcome,) = self.run_epochs([self])
-        if isinstance(outcome, Divergence):
+        if isinstance(outcome, Exception):
             raise outcome
         return outcome
 
     @staticmethod
-    def run_epochs(loops: "Sequence[TrainingLoop]") -> "list[dict[str, float] | Divergence]":
+    def run_epochs(loops: "Sequence[TrainingLoop]") -> Sequence[dict[str, float] | Exception]:
         """Train and validate seeds of one spec, all before the same epoch, for one epoch.
 
         Returns, for each, what `run_epoch` of the seed alone would return or raise.
