@@ -18,5 +18,5 @@ if __name__ == "__main__":
     spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
     cells = [Cell(spec, seed) for seed in range(int(seeds))]
     worker = fake_worker(getattr(fake_loop, loop))
-    events = run_cells(cells, store_url=where, on_event=tell, jobs=int(jobs), worker=worker)
+    events = run_cells(cells, store_url=where, on_event=tell, jobs=int(jobs), together=False, worker=worker)
     print("returned", *(event.kind for event in events), flush=True)

@@ -34,6 +34,7 @@ def compute(
         events.append(event)
         meanwhile(event)
 
+    how = {"together": False, **how}
     final = run_cells(cells, store_url=store.url, on_event=on_event, worker=fake_worker(loop), **how)
     return final, events
 

@@ -112,6 +112,12 @@ class ModelSpec(Frozen):
 
     hidden: Count
     encoder_hidden: Count
+    discriminator_hidden: Count | None  # hidden size of the discriminator; null: `hidden`
+    # frequencies, in radians per scaled unit, of the sines and cosines of positions that the discriminator reads beside
+    # the positions: without them a small network is slow to tell places apart that are close to each other
+    discriminator_waves: Annotated[
+        tuple[Positive, ...], BeforeValidator(lambda v: tuple(v) if isinstance(v, list) else v)
+    ]
     edge_types: Count
     first_type_is_none: bool  # edges of the first type carry no messages
     own_input: bool  # the heads of actor and critics read an agent's own features in addition to its messages

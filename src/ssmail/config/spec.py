@@ -45,6 +45,8 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("data", "letters", None),
     ("model", "initial_scale", 0.1),
     ("model", "standardize", False),
+    ("model", "discriminator_hidden", None),
+    ("model", "discriminator_waves", []),
     ("sac", "encoder_steps", None),
     ("sac", "expansion_steps", 0),
     ("sac", "average", None),

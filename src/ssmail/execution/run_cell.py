@@ -236,9 +236,7 @@ def _train(runs: Sequence[_Run], on_event: Callable[[Event], None], should_stop:
     while runs:
         for run in runs:
             run.writer.share(len(runs))
-        runs = [
-            run for run in runs if run.loop.epoch < run.epochs or run.attempt(run.evaluate, on_event)
-        ]
+        runs = [run for run in runs if run.loop.epoch < run.epochs or run.attempt(run.evaluate, on_event)]
         if not runs:
             return
         if should_stop():

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from ssmail.models.features import NO_WAVES, Waves
 from ssmail.models.linear import Linear
 from ssmail.models.message_passing import EdgeFunction
 
@@ -10,8 +11,10 @@ from ssmail.models.message_passing import EdgeFunction
 class Discriminator(nn.Module):
     """One round of messages over the complete graph, then a perceptron with an unbounded scalar output."""
 
-    def __init__(self, inputs: int, hidden: int) -> None:
+    def __init__(self, inputs: int, hidden: int, waves: Waves = NO_WAVES) -> None:
         super().__init__()
+        self.waves = waves
+        inputs += waves.size
         self.edges = EdgeFunction(inputs, hidden, hidden)
         self.head = nn.Sequential(
             Linear(hidden + inputs, hidden), nn.SiLU(), Linear(hidden, hidden), nn.SiLU(), Linear(hidden, 1)
@@ -19,6 +22,6 @@ class Discriminator(nn.Module):
 
     def forward(self, x: Tensor, action: Tensor) -> Tensor:
         """Map x (..., N, D) and action (..., N, A) to unbounded scores (..., N)."""
-        inputs = torch.cat([x, action], dim=-1)
+        inputs = torch.cat([self.waves(x), action], dim=-1)
         out: Tensor = self.head(torch.cat([self.edges.messages(inputs), inputs], dim=-1))
         return out.squeeze(-1)

@@ -12,6 +12,33 @@ from ssmail.models.normalization import Normalization
 
 
 @dataclass(frozen=True)
+class Waves:
+    """Sines and cosines of the positions among an agent's features, so that a small network can resolve short distances
+    (Tancik et al. 2020).
+
+    axes: the first features, which are the position. frequencies: radians per unit of position.
+    """
+
+    axes: int
+    frequencies: tuple[float, ...]
+
+    @property
+    def size(self) -> int:
+        """The number of features that are added."""
+        return 2 * self.axes * len(self.frequencies)
+
+    def __call__(self, x: Tensor) -> Tensor:
+        """Append the waves to features: (..., F) -> (..., F + size)."""
+        if not self.frequencies:
+            return x
+        phases = torch.cat([frequency * x[..., : self.axes] for frequency in self.frequencies], dim=-1)
+        return torch.cat([x, phases.sin(), phases.cos()], dim=-1)
+
+
+NO_WAVES = Waves(0, ())
+
+
+@dataclass(frozen=True)
 class Features:
     """Computes the features [state, time, first state, agent] of every agent.
 

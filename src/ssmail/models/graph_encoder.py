@@ -30,10 +30,7 @@ class EdgeLSTM(nn.LSTM):
         if weights[0].dim() == 2:
             return remember(weights, sequences, memory)
         memories = [None] * len(sequences) if memory is None else list(zip(*memory, strict=True))
-        made = [
-            remember([w[s] for w in weights], sequences[s], memories[s])
-            for s in range(len(sequences))
-        ]
+        made = [remember([w[s] for w in weights], sequences[s], memories[s]) for s in range(len(sequences))]
         outputs, hidden, cells = zip(*((out, *kept) for out, kept in made), strict=True)
         return torch.stack(outputs), (torch.stack(hidden), torch.stack(cells))
 

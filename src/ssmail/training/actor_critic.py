@@ -212,7 +212,9 @@ class SoftActorCritic:
         for first, last in ((0, start), (start, start + learned), (start + learned, t)):
             if first < last:
                 with torch.set_grad_enabled(first == start):
-                    graph, logit, memory = self.policy.graphs(history[:, :, first:last], noise[:, :, first:last], memory)
+                    graph, logit, memory = self.policy.graphs(
+                        history[:, :, first:last], noise[:, :, first:last], memory
+                    )
                 graphs.append(graph)
                 logits.append(logit)
         return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2, 3, 4))

@@ -27,6 +27,7 @@ from ssmail.losses.labels import checked_label
 from ssmail.losses.self_supervision import assignment, mix, nearest, sample_alpha
 from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
+from ssmail.models.features import Waves
 from ssmail.training.actor_critic import ActorCritic, SoftActorCritic, at_steps
 from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.checkpoint import Stateful
@@ -75,7 +76,9 @@ class AdversarialLearner:
             self.features = self.predictor.features
             inputs = self.features.size(context.experts.states.shape[-1]) + context.experts.actions.shape[-1]
             critic = TwinCritic(inputs, model).to(context.device)
-            self.discriminator = Discriminator(inputs, model.hidden).to(context.device)
+            waves = Waves(context.experts.actions.shape[-1], model.discriminator_waves)
+            hidden = model.discriminator_hidden or model.hidden
+            self.discriminator = Discriminator(inputs, hidden, waves).to(context.device)
         self.actor_critic = ActorCritic(sac, self.predictor, critic, self.generators)
         if self.actor_critic.averaged is not None:
             self.predictor = replace(self.predictor, model=self.actor_critic.averaged)
@@ -180,9 +183,7 @@ class AdversarialTraining:
         """
         count, steps = self.adversarial.rollouts, self.context.steps
         starts = self.experts.draw_each(count, self._generators("data"))
-        interventions = drawn(
-            self.generators, "curriculum", lambda g: draw_interventions(count, steps, frequency, g)
-        )
+        interventions = drawn(self.generators, "curriculum", lambda g: draw_interventions(count, steps, frequency, g))
         made = self.predictor.rollout(
             starts.states[:, :, :1],
             steps,

@@ -69,7 +69,9 @@ class Batch:
 
     def split(self, count: int) -> "tuple[Batch, Batch]":
         """Return the first `count` trajectories and the others, of every seed."""
-        parts = zip(*(x.split([count, self.count - count], self.source.dim() - 1) for x in vars(self).values()), strict=True)
+        parts = zip(
+            *(x.split([count, self.count - count], self.source.dim() - 1) for x in vars(self).values()), strict=True
+        )
         first, others = (Batch(*part) for part in parts)
         return first, others
 
