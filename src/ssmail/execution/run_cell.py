@@ -6,7 +6,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -34,7 +34,7 @@ class Loop(Protocol):
         """Train one epoch and return its metrics. Raises Divergence."""
 
     @staticmethod
-    def run_epochs(loops: Sequence[Self]) -> Sequence[dict[str, float] | Exception]:
+    def run_epochs(loops: Sequence[Any]) -> Sequence[dict[str, float] | Exception]:
         """Train one epoch of each loop, all before the same epoch; return what `run_epoch` would return or raise."""
 
     def final_evaluation(self) -> tuple[dict[str, float], dict[str, np.ndarray]]:

@@ -15,7 +15,8 @@ from ssmail.losses import PER_SEED, Terms
 def ssail_loss(generated: Tensor, expert: Tensor, mixed: Tensor, labels: Tensor) -> tuple[Tensor, Terms]:
     """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (label(alpha) - D(tau_alpha))^2, each averaged over B, T and N.
 
-    labels: (B,), or (S, B), targets for the mixed trajectories: alpha itself in the paper, or that of A.2 (`ssmail.losses.labels`).
+    labels: (B,), or (S, B), targets for the mixed trajectories: alpha itself in the paper, or that of A.2
+    (`ssmail.losses.labels`).
     """
     target = labels.view(*labels.shape, *[1] * (mixed.dim() - labels.dim()))
     terms = {

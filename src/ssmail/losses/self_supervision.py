@@ -29,7 +29,7 @@ def sample_alpha(batch: int, pieces: Sequence[tuple[float, float, float]], gener
 
 
 def mix(generated: Tensor, expert: Tensor, alpha: Tensor) -> Tensor:
-    """Return (1 - alpha) * generated + alpha * expert, for tensors (B, ...) and alpha (B,), or (S, B, ...) and (S, B)."""
+    """Return (1 - alpha) * generated + alpha * expert of tensors (B, ...) and alpha (B,), or (S, B, ...) and (S, B)."""
     a = alpha.view(*alpha.shape, *[1] * (generated.dim() - alpha.dim()))
     return generated + a * (expert - generated)
 

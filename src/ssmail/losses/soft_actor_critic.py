@@ -1,9 +1,11 @@
 """Soft actor-critic (Haarnoja et al. 2018) for N agents that each have a return of their own.
 
 Tensors are (B, T, N) and Q-values of the twin critics (B, T, N, 2), with an axis of S seeds in front or without; losses
-are scalars, or (S,). Temperatures are scalars or broadcast to the tensors. Implementations of SAC differ silently in some
-choices. In ssmail the target entropy is given per action dimension (spec: sac.target_entropy), the temperature loss is
-on the log temperature, and no state is terminal, because episodes end by truncation only.
+are scalars, or (S,). Temperatures are scalars or broadcast to the tensors.
+
+Implementations of SAC differ silently in some choices. In ssmail the target entropy is given per action dimension
+(spec: sac.target_entropy), the temperature loss is on the log temperature, and no state is terminal, because episodes
+end by truncation only.
 """
 
 import torch

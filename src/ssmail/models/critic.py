@@ -52,4 +52,4 @@ class TwinCritic(nn.Module):
         h = torch.relu(self.first(h))
         h = torch.relu(self.second(h))
         q: Tensor = self.last(h).squeeze(-1).movedim(seeds, -1)  # (M, 2)
-        return q.unflatten(-2, x.shape[seeds:-1])
+        return q.view(*x.shape[:-1], 2)

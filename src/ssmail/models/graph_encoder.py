@@ -8,6 +8,7 @@ marginal distribution of every edge at every step is still exactly the softmax, 
 so to one of the expert's modes (docs/paper.md).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,7 +27,7 @@ class EdgeLSTM(nn.LSTM):
 
     def forward(self, sequences: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:  # type: ignore[override]
         """Map sequences (T, E, D) to outputs (T, E, H) and the memory; both may begin with an axis S."""
-        weights: list[Tensor] = self.all_weights[0]
+        weights: Sequence[Tensor] = self.all_weights[0]
         if weights[0].dim() == 2:
             return remember(weights, sequences, memory)
         memories = [None] * len(sequences) if memory is None else list(zip(*memory, strict=True))
@@ -49,7 +50,8 @@ class GraphEncoder(nn.Module):
     def forward(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
         """Map x (B, T, N, D) to logits (B, T, N, N, K) and the memory after the last step.
 
-        With the weights of S seeds, all of them have another axis S in front. The logits of step t depend on x[:, : t + 1] only.
+        With the weights of S seeds, all of them have another axis S in front. The logits of step t depend on
+        x[:, : t + 1] only.
         """
         n = x.shape[-2]
         edges = self.edges_in(x)  # (B, T, N, N, H), sender first
@@ -61,7 +63,7 @@ class GraphEncoder(nn.Module):
         return on_diagonal(logits.transpose(-4, -3), n), memory
 
 
-def remember(weights: list[Tensor], sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
+def remember(weights: Sequence[Tensor], sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
     """Run a one-layer LSTM over sequences (T, edges, D); return its outputs (T, edges, H) and its memory.
 
     Steps come first because torch's LSTM would copy otherwise. A single step, as in a rollout, calls the cell, which
@@ -75,7 +77,7 @@ def remember(weights: list[Tensor], sequences: Tensor, memory: Memory | None) ->
         return sequences.new_zeros(steps, 0, weights[1].shape[1]), memory
     if steps > 1:
         recorded = torch.is_grad_enabled()
-        embedded, hidden, cell = torch.lstm(sequences, memory, weights, True, 1, 0.0, recorded, False, False)
+        embedded, hidden, cell = torch.lstm(sequences, memory, list(weights), True, 1, 0.0, recorded, False, False)
         return embedded, (hidden, cell)
     hidden, cell = torch.lstm_cell(sequences[0], [m[0] for m in memory], *weights)
     return hidden.unsqueeze(0), (hidden.unsqueeze(0), cell.unsqueeze(0))

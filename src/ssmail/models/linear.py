@@ -1,9 +1,9 @@
 """Linear layers of one network, or of S networks of equal shape side by side.
 
-Networks of several seeds are trained as one (`ssmail.training.stacking`): every weight then has a leading axis of S, and
-so does every input. All other operations of a network apply to one and to many alike, so the layers here, and the
-LSTM of the graph encoder, are the only places that know of the axis. Each network's numbers are the same, to the last
-bit, whichever S: a batched product treats its matrices one by one.
+Networks of several seeds are trained as one (`ssmail.training.stacking`): every weight and every input then has a
+leading axis S. All other operations of a network apply to one and to many alike, so the layers here, the critics' twin
+layers and the LSTM of the graph encoder are the only places that know of the axis. Each network's numbers are the same,
+to the last bit, whatever S is: a batched product treats its matrices one by one.
 """
 
 from typing import Any
@@ -40,7 +40,7 @@ class BatchedProduct(torch.autograd.Function):
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
-    """Return W x + b: x (..., D), W (H, D) and b (H,) -> (..., H), or x (S, ..., D), W (S, H, D), b (S, H) -> (S, ..., H)."""
+    """Return W x + b (..., H) of x (..., D), W (H, D) and b (H,), or None; all may have an axis S in front."""
     if weight.dim() == 2:
         return nn.functional.linear(x, weight, bias)
     if weight.shape[1] == 1:  # a product with a single column is rounded differently for one matrix and for many

@@ -166,7 +166,7 @@ class AdversarialTraining:
         latest, interventions = self.generate(frequency)
         for seed, made in zip(self.seeds, latest.of_each(), strict=True):
             seed.replay.add(made)
-        replay = Batch.of_seeds([required(seed.replay.kept) for seed in self.seeds])
+        replay = Batch.of_seeds([seed.replay.trajectories for seed in self.seeds])
         # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
         actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
         logs = [self.update(latest, replay, actor_learns=actor_learns) for _ in range(self.training.updates)]
@@ -202,7 +202,7 @@ class AdversarialTraining:
         batch = self._actor_batch(replay)
         steps = self._pick_steps(batch.actions.shape[2])
         values = self.actor_critic.update(batch, steps, self.reward, actor_learns=actor_learns)
-        means = {name: sum(log[name] for log in logs) / len(logs) for name in logs[0]}
+        means = {name: torch.stack([log[name] for log in logs]).mean(dim=0) for name in logs[0]}
         return means | {name: value.detach() for name, value in values.items()}
 
     def _update_discriminator(self, latest: Batch, replay: Batch) -> dict[str, Tensor]:

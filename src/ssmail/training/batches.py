@@ -103,11 +103,12 @@ class ReplayBuffer:
         joined = batch if self.kept is None else Batch.concatenate([self.kept, batch])
         self.kept = joined[torch.arange(max(len(joined) - self.capacity, 0), len(joined))]
 
-    def sample(self, count: int, generator: torch.Generator) -> Batch:
-        """Draw `count` trajectories uniformly with replacement. Raises ValueError if the buffer is empty."""
+    @property
+    def trajectories(self) -> Batch:
+        """All that it holds. Raises ValueError if the buffer is empty."""
         if self.kept is None:
             raise ValueError("the replay buffer is empty")
-        return self.kept.draw(count, generator)
+        return self.kept
 
     def state_dict(self) -> dict[str, Any]:
         """Return the stored trajectories."""

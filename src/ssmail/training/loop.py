@@ -96,9 +96,9 @@ class TrainingLoop:
         Returns, for each, what `run_epoch` of the seed alone would return or raise.
         """
         began = time.perf_counter()
-        first = loops[0].learner
-        if isinstance(first, AdversarialLearner):
-            trained = first.run_epochs([loop.learner for loop in loops], loops[0].epoch)
+        learners = [loop.learner for loop in loops if isinstance(loop.learner, AdversarialLearner)]
+        if len(learners) == len(loops):
+            trained = AdversarialLearner.run_epochs(learners, loops[0].epoch)
         else:
             trained = [loop.learner.run_epoch(loop.epoch) for loop in loops]
         share = (time.perf_counter() - began) / len(loops)

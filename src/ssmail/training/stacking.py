@@ -1,8 +1,8 @@
 """Networks of several seeds as one, whose weights have a leading axis of seeds, for updates of all seeds at once.
 
 Stacking moves the weights, and the moments of Adam, into one block of memory and leaves every seed with views of its
-part. So each seed's networks and optimizers stay whole: they are evaluated, saved and loaded as if the seed were trained
-alone.
+part. So each seed's networks and optimizers stay whole: they are evaluated, saved and loaded as if the seed were
+trained alone.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class Block:
         sizes = [tensor.numel() for tensor in tensors[0]]
         padding = -sum(sizes) % ALIGNED
         self.values = tensors[0][0].new_zeros(len(tensors), sum(sizes) + padding)
-        pieces = self.values.split([*sizes, padding], dim=1)[:-1]
+        pieces = torch.split(self.values, [*sizes, padding], dim=1)[:-1]
         self.parts = [
             piece.unflatten(1, like.shape) if like.dim() else piece.squeeze(1)
             for piece, like in zip(pieces, tensors[0], strict=True)
