@@ -69,7 +69,7 @@ class Features:
         return state_size * (1 + self.start) + self.time + self.agents
 
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
-        """Map states (..., T, N, D), the first of which is step `first_step`, and start (..., N, D) to (..., T, N, F)."""
+        """Map states (..., T, N, D) from step `first_step` on, and start (..., N, D), to features (..., T, N, F)."""
         *lead, t, n, _ = states.shape
         parts = [self.normalize_states(states)]
         if self.time:

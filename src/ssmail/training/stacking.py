@@ -26,7 +26,7 @@ class Block:
         self.values = tensors[0][0].new_zeros(len(tensors), sum(sizes) + padding)
         pieces = torch.split(self.values, [*sizes, padding], dim=1)[:-1]
         self.parts = [
-            piece.unflatten(1, like.shape) if like.dim() else piece.squeeze(1)
+            piece.view(len(tensors), *like.shape)
             for piece, like in zip(pieces, tensors[0], strict=True)
         ]
         for seed, own in enumerate(tensors):
