@@ -122,3 +122,10 @@ def test_positions_that_are_no_numbers_are_on_no_path(store: Store, add: Add) ->
     found = values(store, add(0, test__rollouts=lost))
     assert (found["test/on_path"], found["test/path_rms"]) == (0, np.inf)
     assert np.isnan(found["test/turn_own"])
+
+
+@pytest.mark.filterwarnings("error")
+def test_positions_too_large_to_be_fitted_have_no_turning(store: Store, add: Add) -> None:
+    huge = ROLLOUTS.copy()
+    huge[..., 0] = 1.7e308  # so their mean is infinite
+    assert values(store, add(0, test__rollouts=huge)) == {"test/on_path": 0, "test/path_rms": np.inf}

@@ -164,6 +164,7 @@ def path_metrics(predicted: Floats, centre_lines: Floats) -> dict[str, float]:
     return {"on_path": float(within.mean()), "path_rms": float(np.sqrt(np.square(own).mean()))}
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
     """Return when agents turn into a lane, from positions (B, T, N, 2) in step lengths that include the start.
 

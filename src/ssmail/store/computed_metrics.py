@@ -5,6 +5,7 @@ The rollouts are those of `test/rollouts`. A compact database keeps only some of
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -68,7 +69,8 @@ def _measured(rollouts: Any, arrays: "_Arrays", run: RunRow, names: Sequence[str
     if not {*PATH}.isdisjoint(names) and (lines := arrays.centre_lines(run)) is not None:
         values |= path_metrics(flat[:, 1:], lines)
     if not {*TURNS}.isdisjoint(names) and (lanes := arrays.lanes(run, rollouts.shape[1:])) is not None:
-        values |= turning(flat, np.tile(lanes, (1, len(rollouts), 1, 1, 1)))
+        with suppress(np.linalg.LinAlgError):  # of positions too large to be fitted
+            values |= turning(flat, np.tile(lanes, (1, len(rollouts), 1, 1, 1)))
     return {f"test/{name}": value for name, value in values.items()}
 
 
