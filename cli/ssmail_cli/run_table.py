@@ -29,9 +29,10 @@ ENVIRONMENT_METRICS = {
         curve="train/mode_mse",
         compared={
             "test/mode_mse": "mode_mse",
-            "test/on_lane": "on_lane",
+            "test/on_path": "on_path",
+            "test/path_rms": "path_rms",
             "test/lane_balance": "balance",
-            "test/min_fde_20": "min_fde_20",
+            "test/min_fde_20": None,
             "test/diverged": None,
             "test_constant_velocity/mode_mse": "const.\nvelocity",
         },

@@ -119,7 +119,8 @@ def compare(
     """Compare specs over their seeds.
 
     Groups the runs that differ only in the seed, and shows mean, standard deviation (n - 1), median and the value of
-    each seed's newest run; for a run without the metric, its state.
+    each seed's newest run; for a run without the metric, its state. test/on_path, test/path_rms and test/turn_* of runs
+    stored before there were such metrics are computed from the rollouts stored of them.
     """
     store = options.open_store(db)
     runs = options.select_runs(store, ids, method, environment, profile, state, figure)
@@ -131,6 +132,7 @@ def compare(
             raise InputError(
                 f"no run compared here has a metric '{metric}'; `ssmail runs show RUN` lists those it has."
             )
+    note(*dict.fromkeys(item.computed for item in found if item.computed))
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
         _print_comparisons(found)
@@ -246,7 +248,9 @@ def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] |
 
 
 def _headings(group: "list[Comparison]") -> dict[str, str]:
-    names = {item.metric: printable(item.metric).replace("_constant_velocity", " constant\nvelocity") for item in group}
+    names = {
+        item.metric: printable(item.metric).replace("_constant_velocity", "\nconstant\nvelocity") for item in group
+    }
     return {metric: name.replace("/", "/\n") for metric, name in names.items()}
 
 

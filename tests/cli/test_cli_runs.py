@@ -136,7 +136,7 @@ def test_show_tells_everything(runs: CommandLine, filled: dict[str, str]) -> Non
     assert shown["run"]["id"] == filled["plain 1"]
     assert shown["spec"]["sac"]["gamma"] == build_spec("ssail", "yjunction", "smoke").sac.gamma
     values = {metric["name"]: metric["value"] for metric in shown["metrics"]}
-    assert values["test/on_lane"] == 0.006
+    assert values["test/on_path"] == 0.006
     rows = {(row["section"], row["name"]): row["value"] for row in runs("show", filled["plain 1"]).rows}
     assert rows["run", "seed"] == "1"
     assert float(rows["spec", "sac.gamma"]) == shown["spec"]["sac"]["gamma"]
@@ -246,9 +246,10 @@ def test_each_environment_is_compared_by_its_own_metrics(
     table = runs("compare", "--format", "table").out
     _, lanes, motion = table.split(": mean ± standard deviation")
     assert lanes.splitlines()[-1] == "mocap"  # the end of the first overview is the heading of the second
-    assert "on_lane" in lanes
+    assert "on_path" in lanes
+    assert "on_lane" not in table
     assert "mse_40" not in lanes
-    assert "on_lane" not in motion
+    assert "on_path" not in motion
     assert [line.split()[:6] for line in motion.splitlines()[-2:]] == [
         ["dnri", build_spec("dnri", "mocap", "smoke").hash()[:8], "2/2", "0.03", "±", "0.014"],
         ["bc", build_spec("bc", "mocap", "smoke").hash()[:8], "1/1", "0.05", "0.05", "0.05"],

@@ -148,6 +148,23 @@ def test_who_never_turns_has_no_turn() -> None:
     assert all(np.isnan(value) for value in metrics.turning(straight, TRUTH.continuations).values())
 
 
+def test_equal_starts_do_not_tell_who_makes_whom_turn() -> None:
+    alike = np.repeat(TRUTH.continuations[:, :1], 40, axis=1)
+    assert np.isfinite(metrics.turn_steps(alike[0])).all()
+    assert all(np.isnan(value) for value in metrics.turning(alike[0], alike).values())
+
+
+def test_many_points_are_as_far_as_each_by_itself() -> None:
+    """Distances are computed in blocks; a point has the same one in any of them."""
+    line = np.array([[0.0, 0.0], [3.0, 1.0], [4.0, -2.0], [4.0, -2.0], [9.0, 0.0]])
+    points = np.random.default_rng(0).normal(size=(3, metrics.BLOCK // 4, 2)) * 5
+    found = metrics.polyline_distances(points, line)
+    assert found.shape == points.shape[:2]
+    some = [(0, 0), (1, 7), (2, -1)]
+    assert [found[place] for place in some] == [metrics.polyline_distances(points[place], line) for place in some]
+    assert metrics.polyline_distances(points[:0], line).shape == (0, metrics.BLOCK // 4)
+
+
 def test_diverged() -> None:
     scaled = np.zeros((4, 5, 3, 2))
     scaled[1, 2, 0, 0], scaled[2, 0, 1, 1], scaled[3, 4, 2, 1] = np.nan, 10.1, -9.9

@@ -22,7 +22,7 @@ def add_run(store: Store) -> AddRun:
 
     The spec is that of the method in profile smoke with `overrides`, or the given one. `epochs` holds more metrics, a
     value for each epoch, `looks` metrics of some epochs; `final` more final ones, and `extra` arrays in place of the
-    handmade ones.
+    handmade ones. With `measured` off, it has no metrics of the path, as runs of earlier versions.
     """
 
     def add(
@@ -38,6 +38,7 @@ def add_run(store: Store) -> AddRun:
         epochs: Mapping[str, Sequence[float]] | None = None,
         final: Mapping[str, float] | None = None,
         looks: Mapping[str, Mapping[int, float]] | None = None,
+        measured: bool = True,
         **extra: np.ndarray,
     ) -> str:
         spec = spec or build_spec(method, "yjunction", "smoke", overrides)
@@ -49,7 +50,8 @@ def add_run(store: Store) -> AddRun:
         if state is RunState.FINISHED:
             writer.arrays({**arrays(shift), **{name.replace("__", "/"): value for name, value in extra.items()}})
             results = {"test/on_lane": 0.9, "test/lane_balance": 0.25, "test_constant_velocity/mode_mse": 0.045}
-            writer.final(len(errors), {**results, **(final or {})})
+            path = {"test/on_path": 0.75, "test/path_rms": 0.5} if measured else {}
+            writer.final(len(errors), {**results, **path, **(final or {})})
         if state is not RunState.RUNNING:
             writer.finish(state)
         return writer.run_id

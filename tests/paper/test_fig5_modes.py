@@ -43,7 +43,8 @@ def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, a
         stored = arrays(shift)["test/rollouts"]
         expected = [stored[0, 0], stored[1, 1], stored[0, 2]]  # start b with sample b % 2
         np.testing.assert_array_equal(panel.rollouts, expected)
-        assert (panel.on_lane, panel.lane_balance, record.outside(panel)) == (0.9, 0.25, 0)
+        assert (panel.on_path, panel.path_rms, panel.lane_balance) == (0.75, 0.5, 0.25)
+        assert record.outside(panel) == 0
     np.testing.assert_array_equal(record.expert, lanes())
     assert record.provenance.run_ids == tuple(runs)
 
@@ -71,9 +72,9 @@ def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: P
         (dots,) = (line for line in axes.lines if line.get_marker() == ".")
         last = rows[rows["step"] == rows["step"].max()]
         np.testing.assert_array_equal(dots.get_xydata(), last[["x", "y"]].to_numpy(np.float32))
-        assert set(rows["on_lane"]) == {0.9}
+        assert (set(rows["on_path"]), set(rows["path_rms"])) == ({0.75}, {0.5})
         assert axes.get_aspect() == 1.0
-    assert words(panels(figure)[1]) == ["seed 1", "90 % on lane", "rarer lane 25 %"]
+    assert words(panels(figure)[1]) == ["seed 1", "75 % on path", "rms 0.5", "rarer lane 25 %"]
     assert figure.get_supxlabel() == "x (step lengths)"
     assert figure.get_supylabel() == "y (step lengths)"
 
@@ -157,3 +158,23 @@ def test_an_unfinished_run_is_refused(store: Store, add_run: Any) -> None:
     run = add_run(0, state=RunState.INTERRUPTED)
     with pytest.raises(InputError, match=rf"^run {run[:8]} \(interrupted\) has no test rollouts; "):
         FIGURES["fig5"].collect(store, [run])
+
+
+def test_an_earlier_run_has_the_numbers_of_its_stored_rollouts(store: Store, add_run: Any) -> None:
+    """Rollout k = 3 s + b is 0.01 k aside of the street, and on a lane of 45 degrees 0.01 k / sqrt(2)."""
+    add_run(0, measured=False)
+    add_run(1, measured=False, shift=1.5)
+    add_run(2)
+    record = FIGURES["fig5"].collect(store)
+    near, far, new = record.panels
+    assert (near.on_path, far.on_path, new.on_path) == (1, 0, 0.75)
+    assert 0.01 < near.path_rms < 0.05
+    assert 1.06 < far.path_rms < 1.55
+    assert record.notes[-1].startswith("test/on_path, test/path_rms of 2 runs, stored before")
+    assert "the 6 test rollouts stored of each" in record.notes[-1]
+
+
+def test_a_panel_has_a_dash_for_what_nobody_knows(store: Store, add_run: Any) -> None:
+    add_run(0, measured=False, lane_centres=np.zeros(0))
+    (axes,) = panels(fig5_modes.draw(FIGURES["fig5"].collect(store)))
+    assert words(axes) == ["seed 0", "- on path", "rms -", "rarer lane 25 %"]

@@ -14,6 +14,8 @@ from ssmail.paper.results import FIGURES
 from ssmail.plots.saving import csv_text
 from ssmail.store import Store
 
+from . import results_table
+
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "results" / "reference"
 NAMES = tuple(f"fig{number}" for number in range(1, 10))
@@ -83,3 +85,11 @@ def test_the_database_is_small(copy: Path) -> None:
 def test_the_verdicts_that_are_shown_are_those_of_the_database(store: Store, page: Path) -> None:
     shown = dict(re.findall(VERDICT, page.read_text("utf-8")))
     assert shown == {found.claim.name: str(found.verdict) for found in judge(store)}
+
+
+def test_the_table_of_results_is_that_of_the_database(store: Store) -> None:
+    page, rows = results_table.PAGE.read_text("utf-8"), results_table.rows(store)
+    assert {"ssail", "gail", "wail", "dnri", results_table.BASELINE} == rows.keys()
+    assert results_table.updated(page, rows) == page
+    other = rows | {"ssail": rows["ssail"].replace("0.0021", "0.0022")}
+    assert results_table.updated(page, other) != page

@@ -14,7 +14,9 @@ ON_PATH_TOLERANCE = 1.0  # step lengths; the expert stays within 0.6
 TURNED = (
     1.5  # step lengths sideways of its start, at which an agent has turned; where it turns is in ssmail.data.yjunction
 )
+TURNING = ("turn_own", "turn_others", "turn_group", "turn_lead")
 DIVERGED = 10.0  # |scaled position|
+BLOCK = 2**14  # distances that are computed at a time
 FORECAST_STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
 
 
@@ -162,6 +164,7 @@ def path_metrics(predicted: Floats, centre_lines: Floats) -> dict[str, float]:
     return {"on_path": float(within.mean()), "path_rms": float(np.sqrt(np.square(own).mean()))}
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
     """Return when agents turn into a lane, from positions (B, T, N, 2) in step lengths that include the start.
 
@@ -171,7 +174,8 @@ def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
     the Y-Junction has -1 / speed, 0 and -1 / speed, because its agents turn where the road does. A group that turns by
     the clock has 0, 0 and 0; if the followers copy the leader, turn_own is small. turn_lead is the mean number of steps
     by which agents turn before the expert, in the mode nearest to the trajectory. Trajectories in which an agent does
-    not turn are left out. All values are NaN if fewer than 2 (N + 1) trajectories remain.
+    not turn are left out. All values are NaN if fewer than 2 (N + 1) trajectories remain, or if their starts do not
+    tell the agents apart.
     """
     modes = nearest_mode(predicted, continuations)
     target = continuations[modes, np.arange(len(modes))]
@@ -179,10 +183,13 @@ def turning(predicted: Floats, continuations: Floats) -> dict[str, float]:
     known = np.isfinite(when).all(axis=1) & np.isfinite(expert).all(axis=1)
     agents = when.shape[1]
     if known.sum() < 2 * (agents + 1):
-        return dict.fromkeys(("turn_own", "turn_others", "turn_group", "turn_lead"), float("nan"))
+        return dict.fromkeys(TURNING, float("nan"))
     starts = predicted[known, 0, :, 0]  # along the street, (B', N)
     design = np.concatenate([starts - starts.mean(axis=0), np.ones((len(starts), 1))], axis=1)
-    slopes = np.linalg.lstsq(design, when[known], rcond=None)[0][:agents]  # (start of, turn of)
+    fit, _, rank, _ = np.linalg.lstsq(design, when[known], rcond=None)
+    if rank <= agents:
+        return dict.fromkeys(TURNING, float("nan"))
+    slopes = fit[:agents]  # (start of, turn of)
     own, group = np.diag(slopes), slopes.sum(axis=0)
     return {
         "turn_own": float(own.mean()),
@@ -257,13 +264,16 @@ def polyline_distances(points: Floats, line: Floats, extended: bool = False) -> 
 
     With `extended` the last segment continues as a ray.
     """
-    steps = np.diff(line, axis=0)
-    x, y = points[..., 0], points[..., 1]
-    squares: Floats = np.full(x.shape, np.inf)
-    for index, ((begin_x, begin_y), (dx, dy)) in enumerate(zip(line[:-1], steps, strict=True)):
-        offset_x, offset_y = x - begin_x, y - begin_y
-        along = (offset_x * dx + offset_y * dy) / max(dx * dx + dy * dy, np.finfo(np.float64).tiny)
-        limit = np.inf if extended and index == len(steps) - 1 else 1.0
-        along = np.clip(along, 0.0, limit)
-        squares = np.minimum(squares, (offset_x - along * dx) ** 2 + (offset_y - along * dy) ** 2)
-    return np.sqrt(squares)
+    (begin_x, begin_y), (step_x, step_y) = line[:-1].T, np.diff(line, axis=0).T
+    limit = np.append(np.ones(len(step_x) - 1), np.inf if extended else 1.0)
+    length = np.maximum(np.square(step_x) + np.square(step_y), np.finfo(np.float64).tiny)  # squared
+    flat = points.reshape(-1, 2)
+    squared = np.empty(len(flat))
+    block = max(1, BLOCK // len(step_x))
+    for first in range(0, len(flat), block):  # so many points at a time, to each segment, as fit into the cache
+        some = slice(first, first + block)
+        x, y = flat[some, 0, None] - begin_x, flat[some, 1, None] - begin_y  # (block, segments)
+        along = np.clip((x * step_x + y * step_y) / length, 0.0, limit)
+        squared[some] = (np.square(x - along * step_x) + np.square(y - along * step_y)).min(axis=-1)
+    distances: Floats = np.sqrt(squared).reshape(points.shape[:-1])
+    return distances

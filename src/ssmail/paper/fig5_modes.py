@@ -2,16 +2,19 @@
 
 Each panel shows sampled rollouts of the best-validation model: one for each of STARTS starts, which are spread over the
 test split, from the samples in turn. A dot marks the end of each agent. Grey lines are the expert's continuations of
-the same starts into both lanes; they are wide only to be visible beneath the rollouts. The shares in a panel are the
-stored test metrics over *all* starts and samples: `test/on_lane` (agents that end on a lane) and `test/lane_balance`
-(rollouts that take the rarer lane, at most 50 %). The panel of a diverged run says that it has no test rollouts.
-Rollouts that leave the frame are cut there and counted.
+the same starts into both lanes; they are wide only to be visible beneath the rollouts. The numbers in a panel are the
+stored test metrics over *all* starts and samples: `test/on_path` (agents whose whole path stays within a step length
+of a lane), `test/path_rms` (their distance from it, in step lengths) and `test/lane_balance` (rollouts that take the
+rarer lane, at most 50 %). A run stored before there were the first two has those of its stored rollouts instead, which
+a note counts. The panel of a diverged run says that it has no test rollouts. Rollouts that leave the frame are cut
+there and counted.
 
 Deviation: the paper shows one set of trajectories for each method; here every seed has its panel.
 
 Claim C2: SS-AIL ends on either lane, DNRI averages over the lanes. To average is to end nearer to the middle between
 the two continuations of a start than to either of them. A policy that always takes the same lane does not tell the
-modes apart either, so both lanes have to be used.
+modes apart either, so both lanes have to be used. Its rule was fixed when there was no `test/on_path`, and so it reads
+`test/on_lane`, which looks at the end of a path only.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,12 +35,13 @@ from ssmail.plots.landscape_grids import draw_paths, path_rows
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.store import RunRow, RunState, Store
-from ssmail.store.comparison import latest_values
+from ssmail.store.comparison import known_values
 
 NAME = "fig5"
 STARTS = 16
 ON_LANE, LANE_BALANCE = "test/on_lane", "test/lane_balance"
-ROLLOUTS, LANES = "test/rollouts", "test/lanes"
+ON_PATH, PATH_RMS = "test/on_path", "test/path_rms"
+ROLLOUTS, LANES, CENTRES = "test/rollouts", "test/lanes", "lane_centres"
 CLAIM = Claim(
     name="C2",
     alias="modes",
@@ -69,7 +73,8 @@ class Panel:
     run_id: str
     seed: int
     rollouts: Floats | None  # (R, T, N, 2) step lengths; None when the run diverged
-    on_lane: float  # 0..1 over all rollouts; NaN when the run diverged
+    on_path: float  # 0..1 over all rollouts; NaN when unknown, as of a run that diverged
+    path_rms: float  # step lengths likewise
     lane_balance: float  # 0..0.5 likewise
 
 
@@ -84,7 +89,7 @@ class ModesRecord:
     notes: tuple[str, ...]
 
     def table(self) -> pd.DataFrame:
-        """[kind, label, run_id, seed, on_lane, lane_balance, lane, trajectory, agent, step, x, y].
+        """[kind, label, run_id, seed, on_path, path_rms, lane_balance, lane, trajectory, agent, step, x, y].
 
         kind: expert, rollout, or diverged (one row without a position). Steps count from 0.
         """
@@ -92,7 +97,7 @@ class ModesRecord:
             path_rows(lane, kind="expert", lane=index).sort_values(ORDER) for index, lane in enumerate(self.expert)
         ]
         table = pd.concat([*lanes, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
-        order = ["kind", "label", "run_id", "seed", "on_lane", "lane_balance", "lane"]
+        order = ["kind", "label", "run_id", "seed", "on_path", "path_rms", "lane_balance", "lane"]
         table = table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
         return table.astype(dict.fromkeys(["seed", "lane", "trajectory", "agent", "step"], "Int64"))
 
@@ -111,14 +116,14 @@ def collect(store: Store, selection: Selection) -> ModesRecord:
     check_settled(selection.runs, "test rollouts")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = shown_lanes(store.array(finished[0].id, LANES)) if finished else np.empty((0, 0, 0, 0, 2))
-    values = latest_values(store, selection.runs, [ON_LANE, LANE_BALANCE])
+    values, computed = known_values(store, selection.runs, [ON_PATH, PATH_RMS, LANE_BALANCE])
     panels = tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
     return ModesRecord(
         panels=panels,
         expert=expert,
         frame=_frame(expert, [panel.rollouts for panel in panels if panel.rollouts is not None]),
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
-        notes=selection.notes,
+        notes=(*selection.notes, *([computed] if computed else [])),
     )
 
 
@@ -138,7 +143,7 @@ def shown_rollouts(samples: Floats) -> Floats:
     return samples[np.arange(len(starts)) % len(samples), starts][None]
 
 
-READS = Reads(arrays={LANES: shown_lanes, ROLLOUTS: shown_rollouts})
+READS = Reads(arrays={LANES: shown_lanes, ROLLOUTS: shown_rollouts, CENTRES: None})
 
 
 def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
@@ -156,17 +161,18 @@ def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
 
 def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
     if run.state is RunState.DIVERGED:
-        return Panel(label, run.id, run.seed, None, np.nan, np.nan)
+        return Panel(label, run.id, run.seed, None, np.nan, np.nan, np.nan)
     rollouts = shown_rollouts(store.array(run.id, ROLLOUTS))[0]
-    return Panel(label, run.id, run.seed, rollouts, values[run.id, ON_LANE], values[run.id, LANE_BALANCE])
+    numbers = (values.get((run.id, name), np.nan) for name in (ON_PATH, PATH_RMS, LANE_BALANCE))
+    return Panel(label, run.id, run.seed, rollouts, *numbers)
 
 
 def _panel_rows(panel: Panel) -> pd.DataFrame:
     run = {"label": panel.label, "run_id": panel.run_id, "seed": panel.seed}
     if panel.rollouts is None:
         return pd.DataFrame([{"kind": "diverged", **run}])
-    shares = {"on_lane": panel.on_lane, "lane_balance": panel.lane_balance}
-    return path_rows(panel.rollouts, kind="rollout", **run, **shares).sort_values(ORDER)
+    numbers = {"on_path": panel.on_path, "path_rms": panel.path_rms, "lane_balance": panel.lane_balance}
+    return path_rows(panel.rollouts, kind="rollout", **run, **numbers).sort_values(ORDER)
 
 
 def share_between(rollouts: Floats, lanes: Floats) -> float:
@@ -256,8 +262,16 @@ def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colou
         draw_paths(axes, panel.rollouts, colour, lw=0.4, alpha=0.8)
         ends = panel.rollouts[:, -1].reshape(-1, 2)
         axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
-        words = [f"{100 * panel.on_lane:.0f} % on lane", f"rarer lane {100 * panel.lane_balance:.0f} %"]
+        words = [
+            f"{_percent(panel.on_path)} on path",
+            f"rms {'-' if np.isnan(panel.path_rms) else f'{panel.path_rms:.2g}'}",
+            f"rarer lane {_percent(panel.lane_balance)}",
+        ]
         if outside := record.outside(panel):
             words.append(f"{outside} of {len(panel.rollouts)} cut off")
     axes.text(0.03, 0.97, title, transform=axes.transAxes, va="top", fontsize=7, weight="bold")
     axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=6)
+
+
+def _percent(share: float) -> str:
+    return "-" if np.isnan(share) else f"{100 * share:.0f} %"

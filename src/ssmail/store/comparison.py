@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ssmail.config.spec import flatten
+from ssmail.store.computed_metrics import computed_metrics, note
 from ssmail.store.queries import RunRow
 from ssmail.store.run_store import Store
 from ssmail.store.schema import RunState
@@ -19,6 +20,7 @@ class Comparison:
     differs: the dotted spec keys in which the compared specs differ, with this spec's values.
     values: the metric's last value by seed; None if the newest run of that seed did not record it.
     states: the state of that run by seed. Runs in every state are included, diverged ones too.
+    computed: how the values that the runs did not store were computed, in one sentence; None if all were stored.
     """
 
     method: str
@@ -29,6 +31,7 @@ class Comparison:
     metric: str
     values: Mapping[int, float | None]
     states: Mapping[int, RunState]
+    computed: str | None = None
 
     @property
     def known(self) -> list[float]:
@@ -67,7 +70,7 @@ def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -
         specs.setdefault(run.spec_hash, []).append(run)
     by_seed = {spec: sorted(found, key=lambda run: run.seed) for spec, found in specs.items()}
     differences = spec_differences(runs)
-    latest = latest_values(store, list(newest.values()), metrics)
+    latest, computed = known_values(store, list(newest.values()), metrics)
     return [
         Comparison(
             method=found[0].method,
@@ -78,6 +81,7 @@ def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -
             metric=metric,
             values={run.seed: latest.get((run.id, metric)) for run in found},
             states={run.seed: run.state for run in found},
+            computed=computed,
         )
         for spec, found in by_seed.items()
         for metric in metrics
@@ -103,3 +107,12 @@ def latest_values(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) 
     frame = store.latest_metrics([run.id for run in runs], metrics)
     keys = zip(frame["run_id"].tolist(), frame["name"].tolist(), strict=True)
     return dict(zip(keys, frame["value"].tolist(), strict=True))
+
+
+def known_values(
+    store: Store, runs: Sequence[RunRow], metrics: Sequence[str]
+) -> tuple[dict[tuple[str, str], float], str | None]:
+    """Return the `latest_values`, completed by those that can be computed from stored rollouts, and a note on these."""
+    stored = latest_values(store, runs, metrics)
+    computed = computed_metrics(store, runs, metrics, stored)
+    return stored | computed.values, note(computed)

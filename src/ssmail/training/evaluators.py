@@ -13,7 +13,14 @@ from ssmail.config.sections import required
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
-from ssmail.evaluation.metrics import forecast_metrics, lane_metrics, lane_test_metrics, letter_metrics, one_step_mse
+from ssmail.evaluation.metrics import (
+    forecast_metrics,
+    lane_metrics,
+    lane_test_metrics,
+    letter_metrics,
+    one_step_mse,
+    turning,
+)
 from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
 from ssmail.training.batches import Arrays, Batch, to_numpy
 from ssmail.training.learner import LearnerContext, Predictor
@@ -87,15 +94,20 @@ class LaneEvaluator(Evaluator):
     selected_by = "validation/mode_mse"
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """Roll out once from every validation start and from some training starts."""
+        """Roll out once from every validation start and from some training starts.
+
+        The validation split has the values of `turning` too, in epochs in which enough groups turn.
+        """
         chosen = self.draw_training()
         trained = self.context.experts.states[chosen.to(self.device), :1]
         starts = torch.cat([self.validation_states[:, :1], trained])
         positions = self.raw_positions(predictor.free_run(starts, self.steps, self.generator))
         count, lines = len(self.data.validation), self.data.centre_lines
         validation, train = self.data.validation.continuations, self.data.train[chosen.numpy()].continuations
+        turned = turning(positions[:count], validation)
         return {
             **_prefixed("validation", lane_metrics(positions[:count], validation, lines, self.scaling)),
+            **_prefixed("validation", {name: value for name, value in turned.items() if math.isfinite(value)}),
             **_prefixed("train", lane_metrics(positions[count:], train, lines, self.scaling)),
         }
 
