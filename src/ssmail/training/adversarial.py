@@ -183,7 +183,17 @@ class AdversarialLearner:
         The method's reward with the current discriminator, scaled by adversarial.reward_scale and clipped to
         adversarial.reward_limit.
         """
-        reward = self.adversarial.reward_scale * self.objective.reward(self.discriminator(x, actions))
+        return self._as_reward(self.discriminator(x, actions))
+
+    def agent_reward(self, agent: int, own: Tensor, x: Tensor, actions: Tensor) -> Tensor:
+        """Return the rewards (...) of one agent as `reward` does, with features `own` (..., F) for its row of x.
+
+        Leading axes broadcast; see `Discriminator.score_agent`.
+        """
+        return self._as_reward(self.discriminator.score_agent(agent, own, x, actions))
+
+    def _as_reward(self, output: Tensor) -> Tensor:
+        reward = self.adversarial.reward_scale * self.objective.reward(output)
         limit = self.adversarial.reward_limit
         return reward if limit is None else reward.clamp(-limit, limit)
 
