@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from ssmail.models import graph_encoder
 from ssmail.models.graph_encoder import GraphEncoder, GraphNoise, graph_entropy, sample_graph
 
 
@@ -26,6 +27,21 @@ def test_step_by_step_equals_the_whole_sequence() -> None:
     torch.testing.assert_close(torch.cat(steps, dim=1), encoder(x)[0])
     forgetful = torch.cat([encoder(x[:, t : t + 1])[0] for t in range(7)], dim=1)  # negative control
     assert not torch.allclose(forgetful, encoder(x)[0])
+
+
+@pytest.mark.parametrize("chunk", [1, 5, 12])
+def test_a_step_of_some_edges_after_the_other_is_that_of_all_edges(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    torch.manual_seed(0)
+    encoder, x = GraphEncoder(4, 6, 2), torch.randn(2, 2, 3, 4)  # 12 edges
+    _, memory = encoder(x[:, :1])
+    expected, (hidden, cell) = encoder(x[:, 1:], memory)
+    calls = []
+    cell_of = torch.lstm_cell
+    monkeypatch.setattr(torch, "lstm_cell", lambda part, *rest: (calls.append(len(part)), cell_of(part, *rest))[1])
+    monkeypatch.setattr(graph_encoder, "CELL_CHUNK", chunk)
+    logits, found = encoder(x[:, 1:], memory)
+    assert calls == [chunk] * (12 // chunk) + [12 % chunk] * bool(12 % chunk)
+    torch.testing.assert_close((logits, *found), (expected, hidden, cell))
 
 
 @pytest.mark.parametrize("shared", ["shared", "edge"])

@@ -14,6 +14,7 @@ ON_PATH_TOLERANCE = 1.0  # step lengths; the expert stays within 0.6
 TURNED = (
     1.5  # step lengths sideways of its start, at which an agent has turned; where it turns is in ssmail.data.yjunction
 )
+CHUNK = 2**13  # coordinates of points whose distances to a line are computed at once
 DIVERGED = 10.0  # |scaled position|
 FORECAST_STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
 
@@ -257,6 +258,11 @@ def polyline_distances(points: Floats, line: Floats, extended: bool = False) -> 
 
     With `extended` the last segment continues as a ray.
     """
+    if (
+        points.size > CHUNK and points.ndim > 1 and len(points) > 1
+    ):  # the distances to all segments of all points at once take gigabytes
+        parts = np.array_split(points, min(len(points), -(-points.size // CHUNK)))
+        return np.concatenate([polyline_distances(part, line, extended) for part in parts])
     begin, step = line[:-1], np.diff(line, axis=0)
     limit = np.append(np.ones(len(step) - 1), np.inf if extended else 1.0)
     offset = points[..., None, :] - begin  # (..., segments, 2)
