@@ -29,19 +29,26 @@ def test_step_by_step_equals_the_whole_sequence() -> None:
     assert not torch.allclose(forgetful, encoder(x)[0])
 
 
+@pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("chunk", [1, 5, 12])
-def test_a_step_of_some_edges_after_the_other_is_that_of_all_edges(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+def test_some_edges_after_the_other_are_all_edges(monkeypatch: pytest.MonkeyPatch, chunk: int, steps: int) -> None:
+    """Outputs, memory and gradients, for single steps and sequences that follow others."""
     torch.manual_seed(0)
-    encoder, x = GraphEncoder(4, 6, 2), torch.randn(2, 2, 3, 4)  # 12 edges
+    encoder, x = GraphEncoder(4, 6, 2).double(), torch.randn(2, 1 + steps, 3, 4).double()  # 12 edges
     _, memory = encoder(x[:, :1])
-    expected, (hidden, cell) = encoder(x[:, 1:], memory)
-    calls = []
-    cell_of = torch.lstm_cell
-    monkeypatch.setattr(torch, "lstm_cell", lambda part, *rest: (calls.append(len(part)), cell_of(part, *rest))[1])
-    monkeypatch.setattr(graph_encoder, "CELL_CHUNK", chunk)
-    logits, found = encoder(x[:, 1:], memory)
-    assert calls == [chunk] * (12 // chunk) + [12 % chunk] * bool(12 % chunk)
-    torch.testing.assert_close((logits, *found), (expected, hidden, cell))
+
+    def results() -> list[torch.Tensor]:
+        logits, found = encoder(x[:, 1:], memory)
+        gradients = torch.autograd.grad(logits.square().sum() + found[1].sum(), encoder.parameters(), retain_graph=True)
+        return [logits, *found, *gradients]
+
+    expected, sizes, advance = results(), [], graph_encoder._advance
+    monkeypatch.setattr(graph_encoder, "EDGES", chunk)
+    monkeypatch.setattr(
+        graph_encoder, "_advance", lambda lstm, x, *m: (sizes.append(x.shape[1]), advance(lstm, x, *m))[1]
+    )
+    torch.testing.assert_close(results(), expected)
+    assert sizes == [chunk] * (12 // chunk) + [12 % chunk] * bool(12 % chunk)
 
 
 @pytest.mark.parametrize("shared", ["shared", "edge"])

@@ -19,7 +19,7 @@ from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perce
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
 
-CELL_CHUNK = 2**12  # edges whose LSTM advances by a single step at once
+EDGES = 2**10  # whose LSTM is computed at once
 
 
 class GraphEncoder(nn.Module):
@@ -51,8 +51,8 @@ class GraphEncoder(nn.Module):
 def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
     """Run a one-layer LSTM over sequences (T, edges, D); return its outputs (T, edges, H) and its memory.
 
-    Steps come first because torch's LSTM would copy otherwise. A single step, as in a rollout, calls the cell, which
-    costs half as much, for some edges after the other so that the gates stay in the processor's cache.
+    Steps come first because torch's LSTM would copy otherwise. Edges do not depend on each other, so some are computed
+    after the other, which keeps their gates in the processor's cache.
     """
     steps, edges, _ = sequences.shape
     if memory is None:
@@ -60,13 +60,19 @@ def remember(lstm: nn.LSTM, sequences: Tensor, memory: Memory | None) -> tuple[T
         memory = (zeros, zeros)
     if not edges:
         return sequences.new_zeros(steps, 0, lstm.hidden_size), memory
-    if steps > 1:
-        embedded, (hidden, cell) = lstm(sequences, memory)
-        return embedded, (hidden, cell)
-    parts = zip(*(torch.split(part[0], CELL_CHUNK) for part in (sequences, *memory)), strict=True)
-    found = [torch.lstm_cell(x, [*past], *lstm.all_weights[0]) for x, *past in parts]
-    hidden, cell = found[0] if len(found) == 1 else (torch.cat(part) for part in zip(*found, strict=True))
-    return hidden.unsqueeze(0), (hidden.unsqueeze(0), cell.unsqueeze(0))
+    parts = zip(*(torch.split(part, EDGES, dim=1) for part in (sequences, *memory)), strict=True)
+    found = [_advance(lstm, *part) for part in parts]
+    embedded, hidden, cell = found[0] if len(found) == 1 else (torch.cat(p, dim=1) for p in zip(*found, strict=True))
+    return embedded, (hidden, cell)
+
+
+def _advance(lstm: nn.LSTM, sequences: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return outputs, hidden and cell state. A single step calls the cell, which costs half as much."""
+    if len(sequences) > 1:
+        embedded, memory = lstm(sequences, (hidden, cell))
+        return embedded, *memory
+    hidden, cell = torch.lstm_cell(sequences[0], [hidden[0], cell[0]], *lstm.all_weights[0])
+    return hidden.unsqueeze(0), hidden.unsqueeze(0), cell.unsqueeze(0)
 
 
 def off_diagonal(pairs: Tensor) -> Tensor:
