@@ -50,7 +50,7 @@ docs: $(DOCS_INSTALLED)  ## the documentation site, with command and API referen
 	$(BIN)/sphinx-build --quiet --fail-on-warning --keep-going -j auto -c docs . build/docs
 	@echo "Now open build/docs/README.html."
 
-bench: $(INSTALLED)  ## how long the command line, an epoch, the store and a training step take (about 10 minutes)
+bench: $(INSTALLED)  ## how long commands, epochs and training steps take, and up to 100 agents (about 20 minutes)
 	$(BIN)/python benchmarks/run.py
 
 clean:  ## remove caches and build outputs; .venv and results/ stay

@@ -1,4 +1,5 @@
-"""`make bench`: time the command line, an epoch of training, the store, and the training steps of nri and dnri.
+"""`make bench`: time the command line, an epoch of training, the store, the training steps of nri and dnri, and how
+training grows with the number of agents.
 
 Training uses one thread.
 """
@@ -11,6 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import cost_by_agents
 import torch
 from message_passing import compare
 from training_step import report
@@ -60,3 +62,4 @@ if __name__ == "__main__":
         print(f"{name:<16}{measure():9.4f} s", flush=True)
     compare()
     report(["authors", "quick"])
+    cost_by_agents.report(Path("build"))

@@ -186,3 +186,15 @@ def test_one_step_error_is_the_mean_over_everything() -> None:
     predicted = truth.copy()
     predicted[0, 1, 0] = [2.0, 0.0, 0.0, 0.0]
     assert one_step_mse(predicted, truth) == 4 / truth.size
+
+
+@pytest.mark.parametrize("chunk", [1, 7, 50])
+def test_distances_of_many_points_are_those_of_each_of_them(monkeypatch: pytest.MonkeyPatch, chunk: int) -> None:
+    rng = np.random.default_rng(0)
+    points, line = rng.normal(size=(5, 3, 2, 2)), rng.normal(size=(4, 2))
+    expected = metrics.polyline_distances(points, line)
+    monkeypatch.setattr(metrics, "CHUNK", chunk)
+    found = metrics.polyline_distances(points, line)
+    assert found.shape == (5, 3, 2)
+    np.testing.assert_array_equal(found, expected)
+    assert found[4, 2, 1] == metrics.polyline_distances(points[4, 2, 1], line)

@@ -3,6 +3,7 @@ import math
 import pytest
 import torch
 
+from ssmail.models import graph_encoder
 from ssmail.models.graph_encoder import GraphEncoder, GraphNoise, graph_entropy, sample_graph
 
 
@@ -26,6 +27,28 @@ def test_step_by_step_equals_the_whole_sequence() -> None:
     torch.testing.assert_close(torch.cat(steps, dim=1), encoder(x)[0])
     forgetful = torch.cat([encoder(x[:, t : t + 1])[0] for t in range(7)], dim=1)  # negative control
     assert not torch.allclose(forgetful, encoder(x)[0])
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize("chunk", [1, 5, 12])
+def test_some_edges_after_the_other_are_all_edges(monkeypatch: pytest.MonkeyPatch, chunk: int, steps: int) -> None:
+    """Outputs, memory and gradients, for single steps and sequences that follow others."""
+    torch.manual_seed(0)
+    encoder, x = GraphEncoder(4, 6, 2).double(), torch.randn(2, 1 + steps, 3, 4).double()  # 12 edges
+    _, memory = encoder(x[:, :1])
+
+    def results() -> list[torch.Tensor]:
+        logits, found = encoder(x[:, 1:], memory)
+        gradients = torch.autograd.grad(logits.square().sum() + found[1].sum(), encoder.parameters(), retain_graph=True)
+        return [logits, *found, *gradients]
+
+    expected, sizes, advance = results(), [], graph_encoder._advance
+    monkeypatch.setattr(graph_encoder, "EDGES", chunk)
+    monkeypatch.setattr(
+        graph_encoder, "_advance", lambda lstm, x, *m: (sizes.append(x.shape[1]), advance(lstm, x, *m))[1]
+    )
+    torch.testing.assert_close(results(), expected)
+    assert sizes == [chunk] * (12 // chunk) + [12 % chunk] * bool(12 % chunk)
 
 
 @pytest.mark.parametrize("shared", ["shared", "edge"])

@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -5,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from ssmail.config.sections import ModelSpec
 from ssmail.models import fast_messages, message_passing
@@ -221,3 +223,57 @@ def test_layers_are_the_same_in_both_forms(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(fast_messages, "SumOverSenders", None)  # so that it is not by sender a second time
     for one, other in zip(by_sender, (typed(x, graph), edges.messages(x)), strict=True):
         torch.testing.assert_close(one, other)
+
+
+@pytest.mark.parametrize("agents", [1, 2, 5, DENSE_UP_TO + 2])
+def test_one_agent_is_scored_as_among_all(agents: int) -> None:
+    """Scores and gradients in double precision; seven features of one agent share three states of the others."""
+    torch.manual_seed(agents)
+    network = Discriminator(6, 8).double()
+    own, x = torch.randn(7, 3, 4).double(), torch.randn(3, agents, 4).double().requires_grad_()
+    action = torch.randn(3, agents, 2).double()
+    for agent in range(agents):
+        here = own.clone().requires_grad_()
+        moved = torch.cat(
+            [x[:, :agent].expand(7, -1, -1, -1), here.unsqueeze(2), x[:, agent + 1 :].expand(7, -1, -1, -1)], 2
+        )
+        expected = network(moved, action.expand(7, -1, -1, -1))
+        scores = network.score_agent(agent, here, x, action)
+        torch.testing.assert_close(scores, expected[..., agent])
+        inputs = [here, x, *network.parameters()]
+        gradients = torch.autograd.grad(expected[..., agent].square().sum(), inputs)
+        torch.testing.assert_close(torch.autograd.grad(scores.square().sum(), inputs), gradients)
+        if agents > 1:  # negative control: the others' scores are other ones
+            assert not torch.allclose(scores, expected[..., agent - 1])
+
+
+class Elements(TorchDispatchMode):
+    """Counts the numbers that operations make: a measure of time and memory that does not depend on the machine."""
+
+    made = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+        out = function(*given, **(named or {}))
+        self.made += out.numel() if isinstance(out, Tensor) else 0
+        return out
+
+
+def elements(agents: int, score: Callable[[Discriminator, Tensor, Tensor, Tensor], Tensor]) -> int:
+    """The numbers made to score positions of an agent among `agents`, each on its own state, gradients included."""
+    torch.manual_seed(0)
+    network, own = Discriminator(6, 8), torch.randn(100, 4, requires_grad=True)
+    x, action = torch.randn(100, agents, 4), torch.randn(100, agents, 2)
+    with Elements() as count:
+        torch.autograd.grad(score(network, own, x, action).sum(), own)
+    return count.made
+
+
+def test_scoring_one_agent_costs_as_much_as_there_are_others() -> None:
+    def among_all(network: Discriminator, own: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        return network(torch.cat([own.unsqueeze(1), x[:, 1:]], dim=1), action)[:, 0]
+
+    def alone(network: Discriminator, own: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        return network.score_agent(0, own, x, action)
+
+    assert elements(80, alone) < 2.1 * elements(40, alone)
+    assert elements(80, among_all) > 3.5 * elements(40, among_all)  # negative control

@@ -127,3 +127,9 @@ def test_a_run_from_before_landscapes_is_refused_with_the_remedy(store: Store, a
     add_run(spec=build_spec("ssail", figure_requirements("fig1").environment, "smoke"))
     with pytest.raises(InputError, match=r"stored no landscape: an older ssmail .* --resume never"):
         collect(store)
+
+
+def test_a_run_that_was_not_asked_for_landscapes_is_refused_with_the_setting(store: Store, add_run: AddRun) -> None:
+    add_run(spec=build_spec("ssail", figure_requirements("fig1").environment, "smoke", ["evaluation.landscapes=null"]))
+    with pytest.raises(InputError, match=r"landscapes is null; run .* --set evaluation\.landscapes=12"):
+        collect(store)

@@ -1,6 +1,7 @@
 """Looking at a reward while it is learned: fields known in closed form, and that looking changes nothing."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -8,10 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.config.experiments import build_spec
+from ssmail.config.experiments import ablation_specs, build_spec, figure_requirements
 from ssmail.config.spec import RunSpec
+from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Features
 from ssmail.models.normalization import Normalization
+from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.baselines import ConstantVelocity
 from ssmail.training.batches import Batch
 from ssmail.training.landscape_recorder import (
@@ -31,7 +34,7 @@ Reward = Callable[[Tensor, Tensor], Tensor]
 
 @pytest.fixture(scope="module")
 def loop() -> TrainingLoop:
-    return TrainingLoop(build_spec("ssail", "yjunction", "smoke"), 0)
+    return TrainingLoop(build_spec("ssail", "yjunction", "smoke", ["evaluation.landscapes=1"]), 0)
 
 
 class Handmade:
@@ -39,6 +42,12 @@ class Handmade:
 
     def __init__(self, loop: TrainingLoop, reward: Reward, features: Features) -> None:
         self.reward, self.features, self.predictor = reward, features, ConstantVelocity(loop.integrator)
+
+    def agent_reward(self, agent: int, own: Tensor, x: Tensor, actions: Tensor) -> Tensor:
+        """The reward of the whole group after the agent has moved."""
+        moved = x.expand(*own.shape[:-1], *x.shape[-2:]).clone()
+        moved[..., agent, :] = own
+        return self.reward(moved, actions.expand(*own.shape[:-1], *actions.shape[-2:]))[..., agent]
 
 
 def looking(loop: TrainingLoop, reward: Reward) -> LandscapeRecorder:
@@ -76,6 +85,37 @@ def test_the_gradient_is_in_scaled_units_whatever_the_networks_read(loop: Traini
     expected = 1 / Normalization.fit(states).std[2, 0]
     torch.testing.assert_close(gradient[..., 0].max(), expected)
     assert expected != 1
+
+
+@pytest.mark.parametrize("root_relative", [False, True])
+def test_moving_one_agent_is_scored_as_the_whole_group_would_be(loop: TrainingLoop, root_relative: bool) -> None:
+    """Rewards and gradients of an agent on other positions, against the reward of all agents in all pairs."""
+    known = loop.experts.states[:2]
+    plain = Features(True, True, 50, root_relative=root_relative)
+    features = replace(plain, normalization=Normalization.fit(plain._relative(known)))
+    assert isinstance(loop.learner, AdversarialLearner)
+    learner = copy(loop.learner)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        learner.discriminator = Discriminator(features.size(4) + 2, 16)
+    learner.features = features
+    at = RewardInputs.from_trajectories(features, known, loop.experts.actions[:2])
+    offsets = 0.02 * torch.randn(4, 1, 1, 3, 2, generator=torch.Generator().manual_seed(0))
+    everyone = at.states[..., :2] + offsets  # four positions for each of the states, which are shared
+    for agent in range(3):
+        positions = everyone[..., agent, :]
+        expected_position = positions.clone().requires_grad_()
+        moved = at.states.expand(4, -1, -1, -1, -1).clone()
+        moved[..., agent, :2] = expected_position
+        x = torch.cat([features.normalize_states(moved), at.other_features.expand(4, -1, -1, -1, -1)], dim=-1)
+        rewards = learner.reward(x, at.actions.expand(4, -1, -1, -1, -1))
+        (expected,) = torch.autograd.grad(rewards[..., agent].sum(), expected_position, retain_graph=True)
+        values, gradient = position_gradient(learner, at, agent, positions)
+        torch.testing.assert_close(values, rewards[..., agent])
+        torch.testing.assert_close(gradient, expected)
+        assert gradient.abs().max() > 1e-3
+        (others,) = torch.autograd.grad(rewards.sum(), expected_position)  # negative control: the reward of them all
+        assert not torch.allclose(gradient, others)
 
 
 def test_a_linear_reward_is_a_plane_with_share_1(loop: TrainingLoop) -> None:
@@ -169,19 +209,38 @@ def test_when_it_is_looked_at() -> None:
     def spec(epochs: int, kept: str) -> RunSpec:
         return build_spec("ssail", "yjunction", "smoke", [f"training.epochs={epochs}", f"evaluation.landscapes={kept}"])
 
-    assert landscape_epochs(spec(40, "null")) == (0, 20, 40)
+    assert landscape_epochs(spec(40, "null")) == ()
+    assert landscape_epochs(spec(40, "1")) == (0, 20, 40)
     assert landscape_epochs(spec(40, "4")) == (0, 10, 20, 30, 40)
     assert landscape_epochs(spec(3, "12")) == (0, 1, 2, 3)
-    assert landscape_epochs(spec(1, "null")) == (0, 1)
+    assert landscape_epochs(spec(1, "1")) == (0, 1)
     assert landscape_epochs(spec(40, "3")) == (0, 13, 20, 27, 40)
     assert current_epoch(spec(80, "null")) == 40
 
 
 def test_what_has_no_plane_or_no_reward_has_no_landscape(toy: ToySpec) -> None:
-    assert TrainingLoop(build_spec("bc", "yjunction", "smoke"), 0).landscapes is None
-    recorded = TrainingLoop(toy("ssail"), 0)
+    asked = "evaluation.landscapes=1"
+    assert TrainingLoop(build_spec("bc", "yjunction", "smoke", [asked]), 0).landscapes is None
+    recorded = TrainingLoop(toy("ssail", asked), 0)
     assert recorded.landscapes is None
     assert recorded.snapshot == {}
+
+
+@pytest.mark.parametrize("figure", ["fig1", "fig2"])
+def test_the_runs_of_the_figures_of_landscapes_record_them(figure: str) -> None:
+    needed = figure_requirements(figure)
+    specs = [build_spec(method, needed.environment, "quick") for method in needed.methods]
+    if needed.ablation is not None:
+        specs = list(ablation_specs(needed.ablation, "quick", environment=needed.environment).values())
+    for spec in specs:
+        assert {0, current_epoch(spec), spec.epochs} <= set(landscape_epochs(spec))
+
+
+def test_a_run_that_nobody_asked_records_none() -> None:
+    loop = TrainingLoop(build_spec("ssail", "yjunction", "smoke"), 0)
+    assert loop.landscapes is None
+    assert loop.snapshot == {}
+    assert not any(name.startswith("landscape") for name in loop.run_epoch())
 
 
 def test_looking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

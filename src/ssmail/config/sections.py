@@ -270,7 +270,7 @@ class EvaluationSpec(Frozen):
     # model selection prefers epochs whose validation lane_balance is at least this
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
     # reward landscapes to store, evenly over the epochs, in addition to those of the untrained and of the current model
-    # (docs/paper.md, Figures 1 and 2); null: one, of the last epoch
+    # (docs/paper.md, Figures 1 and 2); null: none, not even these
     landscapes: Count | None
 
 

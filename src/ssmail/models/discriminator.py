@@ -25,3 +25,15 @@ class Discriminator(nn.Module):
         inputs = torch.cat([self.waves(x), action], dim=-1)
         out: Tensor = self.head(torch.cat([self.edges.messages(inputs), inputs], dim=-1))
         return out.squeeze(-1)
+
+    def score_agent(self, agent: int, own: Tensor, x: Tensor, action: Tensor) -> Tensor:
+        """Return the scores (...) of one agent, with features `own` (..., D) in the place of its row of x.
+
+        This takes N - 1 pairs for each score, where `forward` takes N * N for the scores of all agents. x (..., N, D)
+        and action (..., N, A) are as in `forward`; the leading axes that they share broadcast with those of `own`.
+        """
+        others = [n for n in range(x.shape[-2]) if n != agent]
+        senders = torch.cat([self.waves(x[..., others, :]), action[..., others, :]], dim=-1)
+        inputs = torch.cat([self.waves(own), action[..., agent, :].expand(*own.shape[:-1], -1)], dim=-1)
+        out: Tensor = self.head(torch.cat([self.edges.messages_to_one(inputs, senders), inputs], dim=-1))
+        return out.squeeze(-1)

@@ -103,6 +103,16 @@ class EdgeFunction(nn.Module):
         out: Tensor = self.second(sum_over_senders(s, r, sender_weights(agents, x)).squeeze(-2))
         return out
 
+    def messages_to_one(self, receiver: Tensor, senders: Tensor) -> Tensor:
+        """Return the mean message to a single agent: receiver (..., D) and senders (..., N - 1, D) -> (..., H).
+
+        Leading axes broadcast, so many receivers can share the senders' part of the first layer.
+        """
+        pairs = self.first.sender(senders) + self.first.receiver(receiver).unsqueeze(-2)  # (..., N - 1, H)
+        mean = torch.relu_(pairs).sum(dim=-2) / max(senders.shape[-2], 1)
+        out: Tensor = self.second(mean)
+        return out
+
 
 class TypedMessages(nn.Module):
     """The messages of G-SAC (section 3.2.2): sum_k z_ijk f_e^k([x_i, x_j]), averaged over the senders i.

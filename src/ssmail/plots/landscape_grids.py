@@ -18,6 +18,7 @@ from ssmail.store import RunRow, Store
 MAP = "viridis"
 EXPERT, POLICY = "#D55E00", "#0072B2"  # red and blue of Okabe and Ito, as in the paper's figure
 UNITS = {"letters": "letter heights", "yjunction": "step lengths"}  # by environment, of raw lengths
+FRAMES = 12  # landscapes for a film, as on letters
 LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, of a reward from 0 to 1
 
 
@@ -88,7 +89,10 @@ def _lack(run: RunRow) -> str:
         return f"({run.method}) learns no reward, so it has no landscape; take one of ssail, gail or wail."
     if run.environment == "mocap":
         return "is on mocap, which is not planar; only planar environments have landscapes."
-    options = ("--method", run.method, "--env", run.environment, "--profile", run.profile)
+    options = ["--method", run.method, "--env", run.environment, "--profile", run.profile]
+    if run.spec["evaluation"].get("landscapes") is None:
+        remedy = f"`{command_line('ssmail', 'train', *options, '--set', f'evaluation.landscapes={FRAMES}')}`"
+        return f"stored no landscape, because its setting evaluation.landscapes is null; run {remedy}."
     remedy = f"`{command_line('ssmail', 'train', *options, '--resume', 'never')}`"
     return f"stored no landscape: an older ssmail trained it, or it was stopped before its first epoch; run {remedy}."
 

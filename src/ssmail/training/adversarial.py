@@ -112,6 +112,14 @@ class AdversarialLearner:
         """Return the rewards (..., N) of features x (..., N, F) and actions (..., N, A), with the current networks."""
         return scaled_reward(self.adversarial, self.objective.reward(self.discriminator(x, actions)))
 
+    def agent_reward(self, agent: int, own: Tensor, x: Tensor, actions: Tensor) -> Tensor:
+        """Return the rewards (...) of one agent as `reward` does, with features `own` (..., F) for its row of x.
+
+        Leading axes broadcast; see `Discriminator.score_agent`.
+        """
+        score = self.discriminator.score_agent(agent, own, x, actions)
+        return scaled_reward(self.adversarial, self.objective.reward(score))
+
     def parts(self) -> Mapping[str, Stateful]:
         """Return all networks, optimizers and the replay buffer."""
         return {

@@ -1,7 +1,7 @@
 """Landscapes of the learned reward during training: over the plane, and around the current trajectory.
 
-Only adversarial learners in planar environments have landscapes. Recording one does not change training: its rollouts
-use their own generator, which starts from the same seed every time.
+Only adversarial learners in planar environments have landscapes, and only if the spec asks for them. Recording one does
+not change training: its rollouts use their own generator, which starts from the same seed every time.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,9 @@ ALPHAS_AHEAD = tuple(a / 8 for a in range(8))  # of points on the current trajec
 
 def landscape_epochs(spec: RunSpec) -> tuple[int, ...]:
     """Return the epochs after which to record a landscape, in ascending order; 0 is the untrained model."""
-    count = spec.evaluation.landscapes or 1
+    count = spec.evaluation.landscapes
+    if count is None:
+        return ()
     even = (round(spec.epochs * k / count) for k in range(count + 1))
     return tuple(sorted({*even, current_epoch(spec)}))
 
@@ -59,16 +61,23 @@ class RewardInputs:
         return cls(states[:, :-1], other_features, features.normalize_actions(actions))
 
 
-def position_gradient(learner: AdversarialLearner, at: RewardInputs, agent: int) -> tuple[Tensor, Tensor]:
+def position_gradient(
+    learner: AdversarialLearner, at: RewardInputs, agent: int, position: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
     """Return the agent's reward (...), and its gradient (..., 2) with respect to the agent's own position.
 
-    Everything else is held fixed. The gradient is in scaled units.
+    The agent is at `position` (..., 2), whose leading axes broadcast with those of `at`; by default where it is in
+    `at`. Everything else is held fixed. The gradient is in scaled units. Time and memory grow with N for each position.
     """
-    position = at.states[..., agent, :2].detach().clone().requires_grad_()
-    moved = at.states.detach().clone()
+    position = (at.states[..., agent, :2] if position is None else position).detach().clone().requires_grad_()
+    moved = at.states.expand(*position.shape[:-1], *at.states.shape[-2:]).clone()
     moved[..., agent, :2] = position
-    x = torch.cat([learner.features.normalize_states(moved), at.other_features], dim=-1)
-    values = learner.reward(x, at.actions)[..., agent]
+    read = learner.features.normalize_states(moved)
+    own = torch.cat([read[..., agent, :], at.other_features[..., agent, :].expand(*position.shape[:-1], -1)], dim=-1)
+    # What the others are read as does not depend on the position, unless it is that of the root.
+    others = read if learner.features.root_relative else learner.features.normalize_states(at.states)
+    x = torch.cat([others, at.other_features.expand(*others.shape[:-1], -1)], dim=-1)
+    values = learner.agent_reward(agent, own, x, at.actions.expand(*others.shape[:-1], -1))
     (gradient,) = torch.autograd.grad(values.sum(), position)
     return values.detach(), gradient
 
@@ -94,9 +103,9 @@ class LandscapeRecorder:
 
     @classmethod
     def for_learner(cls, context: LearnerContext, learner: Learner) -> "LandscapeRecorder | None":
-        """Make the recorder of a learner, or return None if there is no plane or no reward."""
-        planar = context.experts.actions.shape[-1] == 2
-        return cls(context, learner) if planar and isinstance(learner, AdversarialLearner) else None
+        """Make the recorder of a learner, or return None if no landscape is asked for, or no plane or reward exists."""
+        wanted = landscape_epochs(context.spec) and context.experts.actions.shape[-1] == 2
+        return cls(context, learner) if wanted and isinstance(learner, AdversarialLearner) else None
 
     def record(self, epoch: int) -> tuple[dict[str, float], Arrays]:
         """Return the metrics and arrays of the current model, after `epoch` epochs; see docs/database.md.
@@ -128,17 +137,18 @@ class LandscapeRecorder:
         The agent is put on each point of the plane. Everything else comes from the K reference states, whose rewards
         are averaged with weights by the distance between the point and the agent's position there.
         """
-        known = self.references
+        known, (agents, height, width, references) = self.references, self.weights.shape
         points = torch.as_tensor(self.plane.points, dtype=known.states.dtype, device=known.states.device)
-        here = [part.expand(*points.shape[:2], *part.shape) for part in vars(known).values()]  # (H, W, K)
-        rewards, gradients = [], []
-        for agent, weights in enumerate(self.weights):
-            states = here[0].clone()
-            states[..., agent, :2] = points.unsqueeze(2)
-            reward, gradient = position_gradient(self.learner, RewardInputs(states, *here[1:]), agent)
-            rewards.append((weights * reward.double().cpu()).sum(dim=2))
-            gradients.append((weights.unsqueeze(-1) * gradient.double().cpu()).sum(dim=2))
-        return torch.stack(rewards).numpy(), torch.stack(gradients).numpy()
+        rewards = torch.empty(agents, height, width, dtype=torch.float64)
+        gradients = torch.empty(agents, height, width, 2, dtype=torch.float64)
+        for agent in range(agents):
+            for row in range(height):  # one at a time, for the sake of the processor's cache
+                position = points[row].unsqueeze(1).expand(width, references, 2)
+                reward, gradient = position_gradient(self.learner, known, agent, position)
+                weights = self.weights[agent, row]
+                rewards[agent, row] = (weights * reward.double().cpu()).sum(dim=1)
+                gradients[agent, row] = (weights.unsqueeze(-1) * gradient.double().cpu()).sum(dim=1)
+        return rewards.numpy(), gradients.numpy()
 
     def rollouts(self) -> Tensor:
         """Sample states (ROLLOUTS, T + 1, N, D) of the current policy from training starts."""
