@@ -14,7 +14,7 @@ from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.graph_encoder import GraphEncoder
 from ssmail.models.policy import Actor
-from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
 from tests.models.test_message_passing import SPEC
 from tests.models.test_variational_encoder import spec
 
@@ -63,6 +63,7 @@ def test_encoders(n: int, batch_norm: bool, training: bool) -> None:
     x = torch.randn(3, 4, n, 5)
     for network in (DynamicEncoder, StaticEncoder):
         assert_same(network(5, spec(batch_norm=batch_norm)).train(training), x)
+    assert_same(WindowEncoder(5, 1, spec(batch_norm=batch_norm, encoder_window=3)).train(training), x)
 
 
 def test_encoders_in_chunks_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:

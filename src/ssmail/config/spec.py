@@ -46,6 +46,7 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("model", "initial_scale", 0.1),
     ("model", "standardize", False),
     ("sac", "encoder_steps", None),
+    ("variational", "encoder_window", None),
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
 )
 _ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set

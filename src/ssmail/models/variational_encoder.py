@@ -4,8 +4,8 @@ Graber and Schwing 2020, section 3).
 Both embed the edges at every step by node -> edge -> node -> edge perceptrons with a skip connection from the first to
 the second edge embedding. DNRI runs an LSTM along each edge, forward in time for the learned prior and backward for the
 posterior, which reads both. NRI's posterior is one graph for the whole trajectory; its prior is fixed
-(losses.likelihood). Where NRI reads all steps of a trajectory in its first layer, this one averages the embeddings of
-an edge over the steps, so that the number of observed steps is free.
+(losses.likelihood). WindowEncoder reads all steps of a trajectory in its first layer, as NRI is published.
+StaticEncoder averages the embeddings of an edge over the steps instead, so that the number of observed steps is free.
 
 Edge tensors are (B, T, N, N - 1, H), receiver by receiver (message_passing.edge_ends). All logits are (B, T, N, N, K),
 sender first, and zero on the diagonal, where there is no edge.
@@ -175,8 +175,43 @@ class EdgeEmbedding(nn.Module):
         return out
 
 
+class WindowEncoder(nn.Module):
+    """NRI as published: one posterior for each edge, from `spec.encoder_window` steps W as one input of each agent.
+
+    A longer history is read from its last W steps; a shorter one as if each agent had been in its first state before,
+    which is what the DNRI authors' code does. Trained on such windows only, the encoder has learned nothing about
+    histories that are much shorter.
+
+    inputs: F. constant: how many of the F features, the last ones, are the same at every step; they are read once.
+    """
+
+    def __init__(self, inputs: int, constant: int, spec: VariationalSpec) -> None:
+        super().__init__()
+        assert spec.encoder_window is not None
+        self.steps, self.moving = spec.encoder_window, inputs - constant
+        self.embedding = EdgeEmbedding(self.steps * self.moving + constant, spec.hidden, spec.batch_norm)
+        self.head = edge_type_head(spec.hidden, spec)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map the observed steps x (B, T, N, F) to posterior logits (B, 1, N, N, K)."""
+        return self._logits(x, 1)
+
+    def running(self, x: Tensor) -> Tensor:
+        """Return for each step the logits (B, T, N, N, K) given the steps of x (B, T, N, F) up to it."""
+        return self._logits(x, x.shape[1])
+
+    def _logits(self, x: Tensor, last: int) -> Tensor:
+        """Return the logits (B, last, N, N, K) of the windows that end at the `last` steps of x (B, T, N, F)."""
+        moving = x[..., : self.moving]
+        before = moving[:, :1].expand(-1, self.steps - 1, -1, -1)
+        read = torch.cat([before, moving], dim=1)[:, -(self.steps - 1 + last) :]
+        windows = read.unfold(1, self.steps, 1).flatten(3)  # (B, last, N, moving * W)
+        edges: ScaledEdges = self.embedding(torch.cat([windows, x[:, -last:, :, self.moving :]], dim=-1))
+        return edge_graph(self.head(edges.tensor()))
+
+
 class StaticEncoder(nn.Module):
-    """NRI: one posterior for each edge of a trajectory."""
+    """NRI for histories of any length: one posterior for each edge, from the mean of its embeddings over the steps."""
 
     def __init__(self, inputs: int, spec: VariationalSpec) -> None:
         super().__init__()
