@@ -7,7 +7,18 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models import fast_messages
-from ssmail.models.fast_messages import ELU, RELU, TANH, Activation, EdgeLayers, both_ways, chunks
+from ssmail.models.fast_messages import (
+    ELU,
+    RELU,
+    TANH,
+    Activation,
+    EdgeLayers,
+    between_different,
+    both_ways,
+    chunks,
+    nonzero_rows,
+    place_among_pairs,
+)
 
 B, T, N, H, D = 3, 5, 4, 6, 2
 
@@ -118,3 +129,37 @@ def test_without_edges_there_is_nothing_to_remember() -> None:
     past, future = nn.LSTM(4, 3), nn.LSTM(4, 3)
     first, both = both_ways(torch.zeros(5, 0, 4), past, future, torch.ones(4), torch.zeros(4))
     assert (first.shape, both.shape) == ((5, 0, 3), (5, 0, 6))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
+def test_edges_without_weight_are_left_out_of_the_gradients(chunk_size: int, share: float) -> None:
+    """One-hot weights, as of sampled graphs, with none, few or most edges of the type: the gradients of all arguments,
+    those of the weights that are 0 included.
+    """
+    given = arguments(skip=False, weighted=True)
+    draw = torch.rand(B, T, N, N - 1, generator=torch.Generator().manual_seed(0))
+    given[6] = (draw < share).double().requires_grad_()
+    leaves = [g for g in given if g is not None]
+    found = []
+    for function in (EdgeLayers.apply, plain):
+        received = function(*given, TANH)[1]
+        found.append(torch.autograd.grad(received.cos().sum() + received.sum(), leaves))
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-10, atol=1e-12)
+    assert bool((found[0][-1] != 0).all())
+
+
+def test_positions_among_all_pairs() -> None:
+    """Of a receiver's senders (N - 1) in the full square (N, N), for all edges of three graphs."""
+    pairs = torch.arange(3 * N * N).view(3, N, N, 1)
+    listed = between_different(pairs).flatten()
+    assert torch.equal(place_among_pairs(torch.arange(len(listed)), N), listed)
+
+
+def test_rows_are_chosen_only_if_many_are_left_out() -> None:
+    weights = torch.zeros(10, 10)
+    weights[:3] = 0.5
+    chosen = nonzero_rows(weights)
+    assert chosen is not None
+    assert chosen.tolist() == list(range(30))
+    assert nonzero_rows(torch.ones(10, 10)) is None

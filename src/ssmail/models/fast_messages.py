@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 CHUNK = 2**18  # numbers in a tensor that is worked on: a megabyte of single precision
 DENSE_UP_TO = 8  # agents: up to this many, all pairs at once are faster than sender by sender
+SPARSE_UP_TO = 0.9  # share of edges with a weight: up to this, leaving out the others saves time
 ONE_BY_ONE_UP_TO = 2**13  # edges times hidden size: up to this many, two calls of torch's LSTM are faster
 
 Chunk = tuple[slice, slice]  # of the axes B and T
@@ -120,13 +121,30 @@ def between_different(pairs: Tensor) -> Tensor:
     return pairs.flatten(1, 2)[:, 1:].view(m, n - 1, n + 1, h)[:, :, :n]
 
 
+def nonzero_rows(weights: Tensor) -> Tensor | None:
+    """Return the positions of the edges with a weight other than 0, or None if choosing them would not save time.
+
+    Sampled graphs are one-hot, so the messages of a type have weight 0 along all edges of another type.
+    """
+    rows = weights.flatten().nonzero().squeeze(-1)
+    return rows if len(rows) < SPARSE_UP_TO * weights.numel() else None
+
+
+def place_among_pairs(edges: Tensor, agents: int) -> Tensor:
+    """Convert positions in (M, N, N - 1), receiver by receiver, to positions in (M, N, N)."""
+    # Of N * N pairs, one on the diagonal comes before every N others, and one before the first.
+    graph, place = edges // (agents * (agents - 1)), edges % (agents * (agents - 1))
+    return graph * agents * agents + place + place // agents + 1
+
+
 class EdgeLayers(torch.autograd.Function):
     """Two layers on each edge, h_ij = act(s_i + r_j + E e_ij) and m_ij = act(W h_ij + b), and the sum of w_ij m_ij over
     the senders i of each receiver j.
 
     s and r are the two halves of the first layer, applied per agent; e_ij is an optional embedding of the edge. Forward
     and backward pass do all of this for as many steps as fit into the processor's cache. m is stored for the gradient,
-    h only where it depends on e: otherwise computing it again is cheaper than fetching it.
+    h only where it depends on e: otherwise computing it again is cheaper than fetching it. Edges of weight 0 have no
+    part in the gradients of the layers and are left out of their products.
     """
 
     @staticmethod
@@ -181,9 +199,11 @@ class EdgeLayers(torch.autograd.Function):
         for number, k in enumerate(chunks(b, t, n * (n - 1) * h)):
             # gradient of m: through the sum over senders, the variance, and m itself
             g, m = grad_received[k].unsqueeze(-2), second[k]
+            kept = None
             if weights is not None and grad_weights is not None:
                 torch.sum(m * g, dim=-1, out=grad_weights[k])
                 g = g * weights[k].unsqueeze(-1)
+                kept = None if grad_second is not None or slope is not None else nonzero_rows(weights[k])
             else:
                 g = g / (n - 1)
             if slope is not None:
@@ -191,8 +211,13 @@ class EdgeLayers(torch.autograd.Function):
             if grad_second is not None:
                 g = grad_second[k] + g
             # second layer
-            g = ctx.activation.gradient(g.expand_as(m), m).flatten(0, 3)
-            hidden = ctx.activation.in_place(first_layer(s[k], r[k])) if edges is None else first[number]
+            g, m = g.expand_as(m).flatten(0, 3), m.flatten(0, 3)
+            hidden = first_layer(s[k], r[k]) if edges is None else first[number]
+            if kept is not None:
+                g, m, hidden = g[kept], m[kept], hidden[kept]
+            g = ctx.activation.gradient(g, m)
+            if edges is None:
+                ctx.activation.in_place(hidden)
             grad_weight.addmm_(g.t(), hidden)
             grad_bias += g.sum(dim=0)
             # first layer
@@ -201,10 +226,13 @@ class EdgeLayers(torch.autograd.Function):
                 torch.mm(g, edge_weight, out=grad_edges[k].flatten(0, 3))
                 grad_edge_weight.addmm_(g.t(), edges[k].flatten(0, 3))
             # the edges go back into all pairs, whose diagonal stays zero, and add up over receivers (s) and senders (r)
-            steps = len(g) // (n * (n - 1))
+            steps = len(second[k].flatten(0, 1))
             if pairs is None or len(pairs) != steps:
                 pairs = g.new_zeros(steps, n, n, h)
-            between_different(pairs).copy_(g.view(steps, n - 1, n, h))
+            if kept is None:
+                between_different(pairs).copy_(g.view(steps, n - 1, n, h))
+            else:
+                pairs.zero_().view(-1, h).index_copy_(0, place_among_pairs(kept, n), g)
             grad_s[k], grad_r[k] = pairs.sum(dim=1).view_as(grad_s[k]), pairs.sum(dim=2).view_as(grad_r[k])
         return grad_s, grad_r, grad_edges, grad_edge_weight, grad_weight, grad_bias, grad_weights, None
 
