@@ -8,6 +8,7 @@ readable form; `message_passing.FAST` chooses, and tests compare the two. Read t
   motion (31 agents, 930 edges, 50 steps) each tensor of edges has hundreds of megabytes; written as one operation after
   the other, much of the time goes into moving them.
 - `both_ways`: dnri's two LSTMs along every edge as one function.
+- `by_steps`: its heads a few steps at a time, whose hidden layers are computed again instead of being stored.
 
 The edge tensors of EdgeLayers hold only the N * (N - 1) edges between different agents, receiver by receiver: axis -3
 of (B, T, N, N - 1, H) is the receiver j, axis -2 its senders in order, j left out.
@@ -325,9 +326,9 @@ def gate_gradients(
     return grad_cell.mul_(f)
 
 
-def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> Tensor:
     """Run one-layer LSTMs over scale * x + shift, `past` forward in time and `future` backward: x (T, E, D), scale and
-    shift (D,) -> the hidden states of the first (T, E, H) and of both (T, E, 2 * H).
+    shift (D,) -> the hidden states (T, E, 2 * H), those of the first before those of the second.
 
     Scale and shift are folded into the weights.
     """
@@ -336,9 +337,9 @@ def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: T
         weights.append((w_input * scale, w_hidden, bias + more_bias + w_input @ shift))
     if x.shape[1] * past.hidden_size < ONE_BY_ONE_UP_TO:
         forward, backward = one_way(x, *weights[0]), one_way(x.flip(0), *weights[1]).flip(0)
-        return forward, torch.cat([forward, backward], dim=-1)
+        return torch.cat([forward, backward], dim=-1)
     both: Tensor = BothWays.apply(x, *(torch.stack(pair) for pair in zip(*weights, strict=True)))  # type: ignore[no-untyped-call]  # torch's
-    return both[..., : past.hidden_size], both
+    return both
 
 
 def one_way(x: Tensor, w_input: Tensor, w_hidden: Tensor, bias: Tensor) -> Tensor:
@@ -348,3 +349,39 @@ def one_way(x: Tensor, w_input: Tensor, w_hidden: Tensor, bias: Tensor) -> Tenso
         return x.new_zeros(len(x), 0, w_hidden.shape[1])
     weights = [w_input, w_hidden, bias, torch.zeros_like(bias)]
     return torch.lstm(x, (start, start), weights, True, 1, 0.0, True, False, False)[0]
+
+
+class BySteps(torch.autograd.Function):
+    """A function of x (T, E, D) -> (T, E, K) for a few steps at a time. The backward pass computes it again."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[[Tensor], Tensor], steps: int, x: Tensor, *weights: Tensor) -> Tensor:
+        """Apply `function`, which reads `weights`, to `steps` steps at a time."""
+        ctx.save_for_backward(x, *weights)
+        ctx.function, ctx.steps = function, steps
+        return torch.cat([function(part) for part in torch.split(x, steps)])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradients of x and of the weights."""
+        x, *weights = ctx.saved_tensors
+        grad_x, grad_weights = torch.empty_like(x), [torch.zeros_like(w) for w in weights]
+        for part, given, out in zip(*(torch.split(y, ctx.steps) for y in (x, grad, grad_x)), strict=True):
+            with torch.enable_grad():
+                read = part.detach().requires_grad_()
+                found = torch.autograd.grad(ctx.function(read), [read, *weights], given)
+            out.copy_(found[0])
+            for total, more in zip(grad_weights, found[1:], strict=True):
+                total += more
+        return None, None, grad_x, *grad_weights
+
+
+def by_steps(function: Callable[[Tensor], Tensor], x: Tensor, weights: Sequence[Tensor], size: int) -> Tensor:
+    """Apply a function, which reads `weights`, to each step of x (T, E, D) -> (T, E, K), as many steps at a time as fit
+    into the processor's cache; `size` is the number of its intermediate results in a step.
+    """
+    steps = max(CHUNK // max(size, 1), 1)
+    if steps >= len(x):
+        return function(x)
+    out: Tensor = BySteps.apply(function, steps, x, *weights)  # type: ignore[no-untyped-call]  # torch's
+    return out

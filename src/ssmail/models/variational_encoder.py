@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import VariationalSpec
 from ssmail.models import message_passing
-from ssmail.models.fast_messages import CHUNK, ELU, EdgeLayers, both_ways
+from ssmail.models.fast_messages import ELU, EdgeLayers, both_ways, by_steps
 from ssmail.models.graph_encoder import Memory, on_diagonal, remember
 
 
@@ -248,13 +248,20 @@ class DynamicEncoder(nn.Module):
         """
         edges: ScaledEdges = self.embedding(x.transpose(0, 1))
         if message_passing.FAST:
-            past, both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
+            both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
+            weights = [*self.prior_head.parameters(), *self.posterior_head.parameters()]
+            logits = by_steps(self._heads, both, weights, both.shape[1] * self.head_size)
         else:
             sequences = edges.tensor().flatten(1, 3)  # (T, B * N * (N - 1), H)
             past, _ = remember(self.past, sequences, None)
             future = remember(self.future, sequences.flip(0), None)[0].flip(0)
-            both = torch.cat([past, future], dim=-1)
-        return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
+            logits = self._heads(torch.cat([past, future], dim=-1))
+        prior, posterior = logits.chunk(2, dim=-1)
+        return self._graph(prior, x), self._graph(posterior, x)
+
+    def _heads(self, both: Tensor) -> Tensor:
+        """Map both hidden states (T, edges, 2 * H) to the logits of prior and posterior (T, edges, 2 * K)."""
+        return torch.cat([self.prior_head(both[..., : self.past.hidden_size]), self.posterior_head(both)], dim=-1)
 
     def prior(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
         """Return the logits (B, T, N, N, K) of the prior alone, for prediction, and the memory after the last step.
@@ -264,13 +271,10 @@ class DynamicEncoder(nn.Module):
         """
         sequences = self.embedding(x.transpose(0, 1)).tensor().flatten(1, 3)
         past, memory = remember(self.past, sequences, memory)
-        return self._logits(self.prior_head, past, x), memory
+        return self._graph(self.prior_head(past), x), memory
 
-    def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:
-        """Apply a head to sequences (T, B * N * (N - 1), H), as many steps at a time as fit into the processor's cache,
-        and arrange its logits as (B, T, N, N, K).
-        """
+    @staticmethod
+    def _graph(logits: Tensor, x: Tensor) -> Tensor:
+        """Arrange logits (T, B * N * (N - 1), K) as (B, T, N, N, K); x is (B, T, N, F)."""
         b, t, n, _ = x.shape
-        steps_at_a_time = max(CHUNK // (b * n * n * self.head_size), 1)
-        logits = torch.cat([head(steps) for steps in torch.split(sequences, steps_at_a_time)])
         return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))
