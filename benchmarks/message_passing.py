@@ -1,19 +1,19 @@
-"""dnri's training step in the fast form of its message passing beside the readable one (message_passing.FAST).
+"""dnri's training step on smaller systems beside the plain form (plain_form.py).
 
 Both forms use the same weights and take turns. The times are CPU seconds, which other programs disturb less.
 """
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
+from plain_form import embed, in_plain_form
 from torch import nn
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import VariationalSpec, required
 from ssmail.losses.likelihood import variational_loss
-from ssmail.models import message_passing
 from ssmail.models.decoders import make_decoder
 from ssmail.models.graph_encoder import GraphNoise, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder
@@ -27,6 +27,7 @@ CASES = {
 ROUNDS = 7
 
 
+FORMS = ("fast", "plain")
 Work = Callable[[], torch.Tensor]  # returns the scalar to differentiate
 
 
@@ -46,40 +47,51 @@ def whole_step(encoder: nn.Module, decoder: nn.Module, states: torch.Tensor, spe
     return loss
 
 
-def messages_only(embed: nn.Module, decoder: nn.Module, states: torch.Tensor, spec: VariationalSpec) -> Work:
+def messages_only(
+    embedded: Callable[[torch.Tensor], torch.Tensor], decoder: nn.Module, states: torch.Tensor, spec: VariationalSpec
+) -> Work:
     """Return a function that computes edge embeddings and the decoder under a given graph: no LSTM, heads or loss."""
     b, t, n, _ = states.shape
     graph = torch.softmax(torch.randn(b, t, n, n, spec.edge_types), dim=-1)
 
     def work() -> torch.Tensor:
-        edges = embed(states)
-        return edges.tensor().sum() + decoder(states, graph)[0].sum()
+        return embedded(states).sum() + decoder(states, graph)[0].sum()
 
     return work
 
 
-def works_of(name: str) -> dict[str, Work]:
-    """Return the functions to time, by name."""
+def works_of(name: str, form: str) -> dict[str, Work]:
+    """Return the functions to time in one of FORMS, by name."""
     (b, t, n, p), hidden, memory, decoder_name = CASES[name]
     spec = required(build_spec("dnri", "yjunction", "quick").variational).model_copy(
         update={"hidden": hidden, "memory": memory, "decoder": decoder_name, "decoder_hidden": hidden}
     )
     torch.manual_seed(0)
     states, encoder, decoder = torch.randn(b, t, n, 2 * p), DynamicEncoder(2 * p, spec), make_decoder(2 * p, p, spec)
+    if form == "plain":
+        in_plain_form(encoder)
+        in_plain_form(decoder)
+
+    def embedded(x: torch.Tensor) -> torch.Tensor:
+        if form == "plain":
+            return embed(encoder.embedding, x.transpose(1, 2).contiguous())
+        edges: torch.Tensor = encoder.embedding(x).tensor()
+        return edges
+
     return {
         "step": whole_step(encoder, decoder, states, spec),
-        "messages": messages_only(encoder.embedding, decoder, states, spec),
+        "messages": messages_only(embedded, decoder, states, spec),
     }
 
 
-def median_seconds(work: Work) -> list[float]:
-    """Return median CPU seconds of the fast and the readable form, forward and backward, without the optimizer.
+def median_seconds(works: Sequence[Work]) -> list[float]:
+    """Return median CPU seconds of each function, forward and backward, without the optimizer. They take turns.
 
     A first round warms up and does not count.
     """
-    taken: tuple[list[float], list[float]] = ([], [])
+    taken: list[list[float]] = [[] for _ in works]
     for _ in range(ROUNDS + 1):
-        for times, message_passing.FAST in zip(taken, (True, False), strict=True):
+        for times, work in zip(taken, works, strict=True):
             begin = time.process_time()
             work().backward()
             times.append(time.process_time() - begin)
@@ -88,11 +100,12 @@ def median_seconds(work: Work) -> list[float]:
 
 def compare() -> None:
     """Print two lines per case: the whole training step, and its message passing alone."""
-    print(f"\n{'dnri, CPU seconds':<34}{'fast':>10}{'readable':>14}{'ratio':>8}")
+    print(f"\n{'dnri, CPU seconds':<34}{'fast':>10}{'plain':>14}{'ratio':>8}")
     for name in CASES:
-        for what, work in works_of(name).items():
-            fast, readable = median_seconds(work)
-            print(f"{name + ', ' + what:<34}{fast:10.4f}{readable:14.4f}{readable / fast:8.2f}", flush=True)
+        forms = [works_of(name, form) for form in FORMS]
+        for what in forms[0]:
+            fast, plain = median_seconds([works[what] for works in forms])
+            print(f"{name + ', ' + what:<34}{fast:10.4f}{plain:14.4f}{plain / fast:8.2f}", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""CPU seconds and peak memory of a training step of dnri and nri, in the fast form and in the readable one.
+"""CPU seconds and peak memory of a training step of dnri and nri, as it is and in the plain form.
 
-A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The forms differ by
-`ssmail.models.message_passing.FAST` only; weights, inputs and random numbers are the same. Each measurement runs in a
-new process with one thread, so that its peak memory is its own; the forms take turns. The first step of each process
-warms up and does not count, but its results are compared between the forms. Equality is checked in double precision, at
-the same widths on windows of SHORT states: in single precision, each form is as far from the exact result as from the
-other form.
+A step is `VariationalLearner._update`: data, forward, backward, clipping and Adam. The plain form (plain_form.py) does
+the operations that the original does, in its order; weights, inputs and random numbers are the same. Each measurement
+runs in a new process with one thread, so that its peak memory is its own; the forms take turns. The first step of each
+process warms up and does not count, but its results are compared between the forms. Equality is checked in double
+precision, at the same widths on windows of SHORT states: in single precision, each form is as far from the exact result
+as from the other form.
 """
 
 import argparse
@@ -20,19 +20,19 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
+from plain_form import in_plain_form
 from torch import Tensor
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.data.scaling import Scaling
 from ssmail.envs.integrator import Integrator
-from ssmail.models import message_passing
 from ssmail.training.batches import Batch
 from ssmail.training.learner import LearnerContext
 from ssmail.training.seeding import Generators
 from ssmail.training.variational import VariationalLearner
 
-FORMS = ("readable", "fast")
+FORMS = ("plain", "fast")
 BATCH = {"dnri": 4, "nri": 8}
 SIZES = {  # agents, states in a window, and hidden, memory, head, decoder_hidden of `variational`
     "authors": (31, 50, (256, 64, 128, 256)),
@@ -40,15 +40,20 @@ SIZES = {  # agents, states in a window, and hidden, memory, head, decoder_hidde
     "toy": (4, 6, (8, 5, 6, 7)),
 }
 ROUNDS, STEPS = 2, 2  # processes of each form, and timed steps of each process
+HEADS = {("nri", "authors"): 256}  # where a method's `head` is another
 SHORT = 7
 TOLERANCE = 1e-9  # of results relative to their largest value, in double precision
 
 
-def spec_of(method: str, size: str) -> RunSpec:
-    """Build the spec of the published models in one of SIZES (reference numbers in docs/architecture.md)."""
+def spec_of(method: str, size: str, states: int) -> RunSpec:
+    """Build the spec of the published models in one of SIZES, for windows of `states`, which nri reads at once."""
     names = ("hidden", "memory", "head", "decoder_hidden")
-    sizes = [f"variational.{name}={value}" for name, value in zip(names, SIZES[size][2], strict=True)]
-    fixed = ["edge_types=2", "first_type_is_none=true", "decoder=recurrent", "batch_norm=true", "temperature=0.5"]
+    values = dict(zip(names, SIZES[size][2], strict=True))
+    values["head"] = HEADS.get((method, size), values["head"])
+    sizes = [f"variational.{name}={value}" for name, value in values.items()]
+    inputs = ["root_relative=false", "agent_input=false", "standardize=false", f"encoder_window={states}"]
+    types = ["edge_types=2", "first_type_is_none=true", "temperature=0.5"]
+    fixed = [*inputs, *types, "decoder=recurrent", "batch_norm=true"]
     others = [f"training.batch={BATCH[method]}", "curriculum.name=teacher-forcing", "cloning.input_noise=0"]
     return build_spec(method, "mocap", "paper", [*sizes, *(f"variational.{value}" for value in fixed), *others])
 
@@ -66,22 +71,16 @@ def make_learner(
     method: str, size: str, form: str, dtype: torch.dtype = torch.float32, states: int | None = None
 ) -> VariationalLearner:
     """Make a learner with the same weights and trajectories in each form; `states` overrides their length."""
-    agents, steps = SIZES[size][0], states or SIZES[size][1]
+    agents, states = SIZES[size][0], states or SIZES[size][1]
     scaling = Scaling(position_min=-1.0, position_max=1.0, velocity_min=-1.0 / 3, velocity_max=1.0 / 3)
-    experts = walkers(agents, steps)
+    experts = walkers(agents, states)
     experts = Batch(experts.states.to(dtype), experts.actions.to(dtype), experts.source)
-    learner = VariationalLearner(LearnerContext(spec_of(method, size), experts, Integrator(scaling), Generators(0)))
+    context = LearnerContext(spec_of(method, size, states), experts, Integrator(scaling), Generators(0))
+    learner = VariationalLearner(context)
     learner.model.to(dtype)
-    update = learner._update
-
-    def in_form(*forcing: Tensor) -> dict[str, float]:
-        message_passing.FAST = form == "fast"
-        try:
-            return update(*forcing)
-        finally:
-            message_passing.FAST = True
-
-    learner._update = in_form
+    if form == "plain":
+        in_plain_form(learner.model.encoder)
+        in_plain_form(learner.model.decoder)
     return learner
 
 
@@ -108,13 +107,13 @@ def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
     return {name: torch.tensor(value, dtype=torch.float64) for name, value in metrics.items()} | seen | gradients
 
 
-def largest_difference(readable: dict[str, Tensor], fast: dict[str, Tensor]) -> tuple[float, float]:
+def largest_difference(plain: dict[str, Tensor], fast: dict[str, Tensor]) -> tuple[float, float]:
     """Return the largest absolute difference, gradients aside, and the largest relative difference.
 
     A difference is relative to the largest value of its result.
     """
     absolute = relative = 0.0
-    for name, value in readable.items():
+    for name, value in plain.items():
         difference = float((value - fast[name]).abs().max())
         relative = max(relative, difference / max(float(value.abs().max()), 1e-12))
         if name.startswith(("encoder", "decoder")):
@@ -156,12 +155,12 @@ def compare_steps(method: str, size: str, rounds: int, steps: int) -> None:
             measured = json.loads(done.stdout)
             seconds[form] += measured["seconds"]
             peak[form] = max(peak[form], measured["peak"])
-        readable, fast = (torch.load(Path(folder) / form) for form in FORMS)
+        plain, fast = (torch.load(Path(folder) / form) for form in FORMS)
     median = {form: statistics.median(taken) for form, taken in seconds.items()}
     for form in FORMS:
-        ratio = f"{median['readable'] / median[form]:8.2f}{peak['readable'] / peak[form]:8.2f}"
+        ratio = f"{median['plain'] / median[form]:8.2f}{peak['plain'] / peak[form]:8.2f}"
         print(f"{method + ', ' + size + ', ' + form:<34}{median[form]:10.3f}{peak[form]:10.0f}{ratio}", flush=True)
-    absolute, relative = largest_difference(readable, fast)
+    absolute, relative = largest_difference(plain, fast)
     print(f"  in single precision: outputs to {absolute:.1e}, gradients to {relative:.1e} of the largest value")
     check_equal(method, size)
 

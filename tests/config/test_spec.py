@@ -136,6 +136,19 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     assert specs.with_added_keys({"self_supervision": None}) == {"self_supervision": None}
 
 
+def test_stored_runs_of_nri_embed_step_by_step() -> None:
+    """They have no key encoder_window, and their spec keeps its hash; the published form has another."""
+    any_length = build_spec("nri", "mocap", "quick", ["variational.encoder_window=null"])
+    values = any_length.model_dump(mode="json")
+    del values["variational"]["encoder_window"]
+    assert specs.spec_hash(values) == any_length.hash()
+    assert RunSpec.model_validate(specs.with_added_keys(values)) == any_length
+    published = build_spec("nri", "mocap", "quick")
+    assert published.variational.encoder_window == published.forecast.observed == 50
+    assert published.hash() != any_length.hash()
+    assert build_spec("nri", "yjunction", "quick").variational.encoder_window is None
+
+
 @pytest.mark.parametrize(
     ("given", "label"),
     [

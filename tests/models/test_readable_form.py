@@ -14,7 +14,7 @@ from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.graph_encoder import GraphEncoder
 from ssmail.models.policy import Actor
-from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
 from tests.models.test_message_passing import SPEC
 from tests.models.test_variational_encoder import spec
 
@@ -40,6 +40,7 @@ def in_readable_form(network: nn.Module, *inputs: Tensor) -> list[Tensor]:
         patch.setattr(decoders, "EdgeLayers", None)  # so that the comparison is not of one form with itself
         patch.setattr(variational_encoder, "EdgeLayers", None)
         patch.setattr(variational_encoder, "both_ways", None)
+        patch.setattr(variational_encoder, "by_steps", None)
         patch.setattr(message_passing, "sum_over_senders", None)
         return outputs_and_gradients(network, *inputs)
 
@@ -63,13 +64,13 @@ def test_encoders(n: int, batch_norm: bool, training: bool) -> None:
     x = torch.randn(3, 4, n, 5)
     for network in (DynamicEncoder, StaticEncoder):
         assert_same(network(5, spec(batch_norm=batch_norm)).train(training), x)
+    assert_same(WindowEncoder(5, 1, spec(batch_norm=batch_norm, encoder_window=3)).train(training), x)
 
 
 def test_encoders_in_chunks_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """As larger systems are computed."""
     monkeypatch.setattr(fast_messages, "ONE_BY_ONE_UP_TO", 0)
     monkeypatch.setattr(fast_messages, "CHUNK", 2 * 4 * 3 * 8)
-    monkeypatch.setattr(variational_encoder, "CHUNK", 2 * 3 * 4 * 4 * 6)
     torch.manual_seed(0)
     x = torch.randn(3, 5, 4, 5)
     for network in (DynamicEncoder, StaticEncoder):

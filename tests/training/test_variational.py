@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from ssmail.config.experiments import build_spec
+from ssmail.errors import InputError
 from ssmail.training.loop import TrainingLoop
-from ssmail.training.variational import VariationalLearner
+from ssmail.training.variational import VariationalLearner, evaluation_mode
 
 
 def learner(method: str = "dnri", *overrides: str) -> VariationalLearner:
@@ -133,6 +134,46 @@ def test_nri_infers_its_graph_from_all_that_was_observed(monkeypatch: pytest.Mon
     made.predictor.free_run(observed, 3, torch.Generator(), noise=noise)
     assert len(seen) == 1
     assert torch.equal(seen[0], observed + noise[:, :6])
+
+
+def test_nri_as_published_reads_the_whole_window_and_predicts_from_what_was_observed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made, seen = learner("nri", "variational.encoder_window=50"), []
+    made.model.encoder.register_forward_hook(lambda _, given, logits: seen.append((given[0], logits)))
+    always = torch.ones(made.training.batch, made.context.steps, dtype=torch.bool)
+    made._update(always)
+    assert seen[0][0].shape[1] == made.context.steps + 1 == 50  # the last state too, as in the authors' code
+    observed = made.context.experts.states[:2, :6]
+    made.predictor.free_run(observed, 3, torch.Generator())
+    assert torch.equal(seen[1][0], made.model.read(observed))
+    with evaluation_mode(made.model):
+        torch.testing.assert_close(made.model.past_logits(observed)[:, -1:], seen[1][1])
+    plain, seen = learner("nri"), []
+    plain.model.encoder.register_forward_hook(lambda _, given, logits: seen.append((given[0], logits)))
+    plain._update(always)
+    assert seen[0][0].shape[1] == 49  # negative control: the form for any length
+
+
+def test_nri_as_published_learns_its_graph_and_resumes() -> None:
+    """From a checkpoint, the next epoch is the one that it would have been."""
+    loops = [TrainingLoop(build_spec("nri", "yjunction", "smoke", ["variational.encoder_window=50"]), 0) for _ in "ab"]
+    before = deepcopy(loops[0].learner.model.encoder.state_dict())
+    loops[0].run_epoch()
+    after = loops[0].learner.model.encoder.state_dict()
+    assert not torch.equal(before["embedding.nodes_in.first.weight"], after["embedding.nodes_in.first.weight"])
+    loops[1].load_state_dict(deepcopy(loops[0].state_dict()))
+    next_epochs = [loop.run_epoch() for loop in loops]
+    for metrics in next_epochs:
+        metrics.pop("seconds")
+    assert next_epochs[0] == next_epochs[1]
+
+
+def test_nri_as_published_needs_two_vectors_for_batch_norm() -> None:
+    single = ["variational.encoder_window=50", "data.yjunction.agents=1", "training.batch=1"]
+    with pytest.raises(InputError, match="batch norm needs two agents"):
+        learner("nri", *single)
+    learner("nri", *single, "variational.batch_norm=false")
 
 
 @pytest.mark.parametrize("method", ["nri", "dnri"])

@@ -225,6 +225,8 @@ class VariationalSpec(Frozen):
     edge_types: Count
     first_type_is_none: bool  # edges of the first type carry no messages
     batch_norm: bool  # in the encoder
+    # nri: steps that its encoder reads as one input, as published; null: any number, embedded one by one and averaged
+    encoder_window: Count | None
     temperature: Positive  # temperature of the Gumbel-softmax relaxation
     variance: Positive  # of the Gaussian likelihood, scaled units squared
     kl_weight: NonNegative  # weight of the KL divergence of the posterior from the prior

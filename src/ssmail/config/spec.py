@@ -50,6 +50,7 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("sac", "encoder_steps", None),
     ("sac", "expansion_steps", 0),
     ("sac", "average", None),
+    ("variational", "encoder_window", None),
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
 )
 _ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set

@@ -8,6 +8,7 @@ readable form; `message_passing.FAST` chooses, and tests compare the two. Read t
   motion (31 agents, 930 edges, 50 steps) each tensor of edges has hundreds of megabytes; written as one operation after
   the other, much of the time goes into moving them.
 - `both_ways`: dnri's two LSTMs along every edge as one function.
+- `by_steps`: its heads a few steps at a time, whose hidden layers are computed again instead of being stored.
 
 The edge tensors of EdgeLayers hold only the N * (N - 1) edges between different agents, receiver by receiver: axis -3
 of (B, T, N, N - 1, H) is the receiver j, axis -2 its senders in order, j left out.
@@ -22,7 +23,8 @@ import torch
 from torch import Tensor, nn
 
 CHUNK = 2**18  # numbers in a tensor that is worked on: a megabyte of single precision
-DENSE_UP_TO = 8
+DENSE_UP_TO = 8  # agents: up to this many, all pairs at once are faster than sender by sender
+SPARSE_UP_TO = 0.9  # share of edges with a weight: up to this, leaving out the others saves time
 ONE_BY_ONE_UP_TO = 2**13  # edges times hidden size: up to this many, two calls of torch's LSTM are faster
 
 Chunk = tuple[slice, slice]  # of the axes B and T
@@ -123,13 +125,30 @@ def between_different(pairs: Tensor) -> Tensor:
     return pairs.flatten(1, 2)[:, 1:].view(m, n - 1, n + 1, h)[:, :, :n]
 
 
+def nonzero_rows(weights: Tensor) -> Tensor | None:
+    """Return the positions of the edges with a weight other than 0, or None if choosing them would not save time.
+
+    Sampled graphs are one-hot, so the messages of a type have weight 0 along all edges of another type.
+    """
+    rows = weights.flatten().nonzero().squeeze(-1)
+    return rows if len(rows) < SPARSE_UP_TO * weights.numel() else None
+
+
+def place_among_pairs(edges: Tensor, agents: int) -> Tensor:
+    """Convert positions in (M, N, N - 1), receiver by receiver, to positions in (M, N, N)."""
+    # Of N * N pairs, one on the diagonal comes before every N others, and one before the first.
+    graph, place = edges // (agents * (agents - 1)), edges % (agents * (agents - 1))
+    return graph * agents * agents + place + place // agents + 1
+
+
 class EdgeLayers(torch.autograd.Function):
     """Two layers on each edge, h_ij = act(s_i + r_j + E e_ij) and m_ij = act(W h_ij + b), and the sum of w_ij m_ij over
     the senders i of each receiver j.
 
     s and r are the two halves of the first layer, applied per agent; e_ij is an optional embedding of the edge. Forward
     and backward pass do all of this for as many steps as fit into the processor's cache. m is stored for the gradient,
-    h only where it depends on e: otherwise computing it again is cheaper than fetching it.
+    h only where it depends on e: otherwise computing it again is cheaper than fetching it. Edges of weight 0 have no
+    part in the gradients of the layers and are left out of their products.
     """
 
     @staticmethod
@@ -184,9 +203,11 @@ class EdgeLayers(torch.autograd.Function):
         for number, k in enumerate(chunks(b, t, n * (n - 1) * h)):
             # gradient of m: through the sum over senders, the variance, and m itself
             g, m = grad_received[k].unsqueeze(-2), second[k]
+            kept = None
             if weights is not None and grad_weights is not None:
                 torch.sum(m * g, dim=-1, out=grad_weights[k])
                 g = g * weights[k].unsqueeze(-1)
+                kept = None if grad_second is not None or slope is not None else nonzero_rows(weights[k])
             else:
                 g = g / (n - 1)
             if slope is not None:
@@ -194,8 +215,13 @@ class EdgeLayers(torch.autograd.Function):
             if grad_second is not None:
                 g = grad_second[k] + g
             # second layer
-            g = ctx.activation.gradient(g.expand_as(m), m).flatten(0, 3)
-            hidden = ctx.activation.in_place(first_layer(s[k], r[k])) if edges is None else first[number]
+            g, m = g.expand_as(m).flatten(0, 3), m.flatten(0, 3)
+            hidden = first_layer(s[k], r[k]) if edges is None else first[number]
+            if kept is not None:
+                g, m, hidden = g[kept], m[kept], hidden[kept]
+            g = ctx.activation.gradient(g, m)
+            if edges is None:
+                ctx.activation.in_place(hidden)
             grad_weight.addmm_(g.t(), hidden)
             grad_bias += g.sum(dim=0)
             # first layer
@@ -204,10 +230,13 @@ class EdgeLayers(torch.autograd.Function):
                 torch.mm(g, edge_weight, out=grad_edges[k].flatten(0, 3))
                 grad_edge_weight.addmm_(g.t(), edges[k].flatten(0, 3))
             # the edges go back into all pairs, whose diagonal stays zero, and add up over receivers (s) and senders (r)
-            steps = len(g) // (n * (n - 1))
+            steps = len(second[k].flatten(0, 1))
             if pairs is None or len(pairs) != steps:
                 pairs = g.new_zeros(steps, n, n, h)
-            between_different(pairs).copy_(g.view(steps, n - 1, n, h))
+            if kept is None:
+                between_different(pairs).copy_(g.view(steps, n - 1, n, h))
+            else:
+                pairs.zero_().view(-1, h).index_copy_(0, place_among_pairs(kept, n), g)
             grad_s[k], grad_r[k] = pairs.sum(dim=1).view_as(grad_s[k]), pairs.sum(dim=2).view_as(grad_r[k])
         return grad_s, grad_r, grad_edges, grad_edge_weight, grad_weight, grad_bias, grad_weights, None
 
@@ -300,9 +329,9 @@ def gate_gradients(
     return grad_cell.mul_(f)
 
 
-def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> tuple[Tensor, Tensor]:
+def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: Tensor) -> Tensor:
     """Run one-layer LSTMs over scale * x + shift, `past` forward in time and `future` backward: x (T, E, D), scale and
-    shift (D,) -> the hidden states of the first (T, E, H) and of both (T, E, 2 * H).
+    shift (D,) -> the hidden states (T, E, 2 * H), those of the first before those of the second.
 
     Scale and shift are folded into the weights.
     """
@@ -311,9 +340,9 @@ def both_ways(x: Tensor, past: nn.LSTM, future: nn.LSTM, scale: Tensor, shift: T
         weights.append((w_input * scale, w_hidden, bias + more_bias + w_input @ shift))
     if x.shape[1] * past.hidden_size < ONE_BY_ONE_UP_TO:
         forward, backward = one_way(x, *weights[0]), one_way(x.flip(0), *weights[1]).flip(0)
-        return forward, torch.cat([forward, backward], dim=-1)
+        return torch.cat([forward, backward], dim=-1)
     both: Tensor = BothWays.apply(x, *(torch.stack(pair) for pair in zip(*weights, strict=True)))  # type: ignore[no-untyped-call]  # torch's
-    return both[..., : past.hidden_size], both
+    return both
 
 
 def one_way(x: Tensor, w_input: Tensor, w_hidden: Tensor, bias: Tensor) -> Tensor:
@@ -323,3 +352,39 @@ def one_way(x: Tensor, w_input: Tensor, w_hidden: Tensor, bias: Tensor) -> Tenso
         return x.new_zeros(len(x), 0, w_hidden.shape[1])
     weights = [w_input, w_hidden, bias, torch.zeros_like(bias)]
     return torch.lstm(x, (start, start), weights, True, 1, 0.0, True, False, False)[0]
+
+
+class BySteps(torch.autograd.Function):
+    """A function of x (T, E, D) -> (T, E, K) for a few steps at a time. The backward pass computes it again."""
+
+    @staticmethod
+    def forward(ctx: Any, function: Callable[[Tensor], Tensor], steps: int, x: Tensor, *weights: Tensor) -> Tensor:
+        """Apply `function`, which reads `weights`, to `steps` steps at a time."""
+        ctx.save_for_backward(x, *weights)
+        ctx.function, ctx.steps = function, steps
+        return torch.cat([function(part) for part in torch.split(x, steps)])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        """Return the gradients of x and of the weights."""
+        x, *weights = ctx.saved_tensors
+        grad_x, grad_weights = torch.empty_like(x), [torch.zeros_like(w) for w in weights]
+        for part, given, out in zip(*(torch.split(y, ctx.steps) for y in (x, grad, grad_x)), strict=True):
+            with torch.enable_grad():
+                read = part.detach().requires_grad_()
+                found = torch.autograd.grad(ctx.function(read), [read, *weights], given)
+            out.copy_(found[0])
+            for total, more in zip(grad_weights, found[1:], strict=True):
+                total += more
+        return None, None, grad_x, *grad_weights
+
+
+def by_steps(function: Callable[[Tensor], Tensor], x: Tensor, weights: Sequence[Tensor], size: int) -> Tensor:
+    """Apply a function, which reads `weights`, to each step of x (T, E, D) -> (T, E, K), as many steps at a time as fit
+    into the processor's cache; `size` is the number of its intermediate results in a step.
+    """
+    steps = max(CHUNK // max(size, 1), 1)
+    if steps >= len(x):
+        return function(x)
+    out: Tensor = BySteps.apply(function, steps, x, *weights)  # type: ignore[no-untyped-call]  # torch's
+    return out

@@ -4,8 +4,8 @@ Graber and Schwing 2020, section 3).
 Both embed the edges at every step by node -> edge -> node -> edge perceptrons with a skip connection from the first to
 the second edge embedding. DNRI runs an LSTM along each edge, forward in time for the learned prior and backward for the
 posterior, which reads both. NRI's posterior is one graph for the whole trajectory; its prior is fixed
-(losses.likelihood). Where NRI reads all steps of a trajectory in its first layer, this one averages the embeddings of
-an edge over the steps, so that the number of observed steps is free.
+(losses.likelihood). WindowEncoder reads all steps of a trajectory in its first layer, as NRI is published.
+StaticEncoder averages the embeddings of an edge over the steps instead, so that the number of observed steps is free.
 
 Edge tensors are (B, T, N, N - 1, H), receiver by receiver (message_passing.edge_ends). All logits are (B, T, N, N, K),
 sender first, and zero on the diagonal, where there is no edge.
@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import VariationalSpec
 from ssmail.models import message_passing
-from ssmail.models.fast_messages import CHUNK, ELU, EdgeLayers, both_ways
+from ssmail.models.fast_messages import ELU, EdgeLayers, both_ways, by_steps
 from ssmail.models.graph_encoder import Memory, on_diagonal, remember
 
 
@@ -175,8 +175,43 @@ class EdgeEmbedding(nn.Module):
         return out
 
 
+class WindowEncoder(nn.Module):
+    """NRI as published: one posterior for each edge, from `spec.encoder_window` steps W as one input of each agent.
+
+    A longer history is read from its last W steps; a shorter one as if each agent had been in its first state before,
+    which is what the DNRI authors' code does. Trained on such windows only, the encoder has learned nothing about
+    histories that are much shorter.
+
+    inputs: F. constant: how many of the F features, the last ones, are the same at every step; they are read once.
+    """
+
+    def __init__(self, inputs: int, constant: int, spec: VariationalSpec) -> None:
+        super().__init__()
+        assert spec.encoder_window is not None
+        self.steps, self.moving = spec.encoder_window, inputs - constant
+        self.embedding = EdgeEmbedding(self.steps * self.moving + constant, spec.hidden, spec.batch_norm)
+        self.head = edge_type_head(spec.hidden, spec)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map the observed steps x (B, T, N, F) to posterior logits (B, 1, N, N, K)."""
+        return self._logits(x, 1)
+
+    def running(self, x: Tensor) -> Tensor:
+        """Return for each step the logits (B, T, N, N, K) given the steps of x (B, T, N, F) up to it."""
+        return self._logits(x, x.shape[1])
+
+    def _logits(self, x: Tensor, last: int) -> Tensor:
+        """Return the logits (B, last, N, N, K) of the windows that end at the `last` steps of x (B, T, N, F)."""
+        moving = x[..., : self.moving]
+        before = moving[:, :1].expand(-1, self.steps - 1, -1, -1)
+        read = torch.cat([before, moving], dim=1)[:, -(self.steps - 1 + last) :]
+        windows = read.unfold(1, self.steps, 1).flatten(3)  # (B, last, N, moving * W)
+        edges: ScaledEdges = self.embedding(torch.cat([windows, x[:, -last:, :, self.moving :]], dim=-1))
+        return edge_graph(self.head(edges.tensor()))
+
+
 class StaticEncoder(nn.Module):
-    """NRI: one posterior for each edge of a trajectory."""
+    """NRI for histories of any length: one posterior for each edge, from the mean of its embeddings over the steps."""
 
     def __init__(self, inputs: int, spec: VariationalSpec) -> None:
         super().__init__()
@@ -213,13 +248,20 @@ class DynamicEncoder(nn.Module):
         """
         edges: ScaledEdges = self.embedding(x.transpose(0, 1))
         if message_passing.FAST:
-            past, both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
+            both = both_ways(edges.values.flatten(1, 3), self.past, self.future, edges.scale, edges.shift)
+            weights = [*self.prior_head.parameters(), *self.posterior_head.parameters()]
+            logits = by_steps(self._heads, both, weights, both.shape[1] * self.head_size)
         else:
             sequences = edges.tensor().flatten(1, 3)  # (T, B * N * (N - 1), H)
             past, _ = remember(self.past.all_weights[0], sequences, None)
             future = remember(self.future.all_weights[0], sequences.flip(0), None)[0].flip(0)
-            both = torch.cat([past, future], dim=-1)
-        return self._logits(self.prior_head, past, x), self._logits(self.posterior_head, both, x)
+            logits = self._heads(torch.cat([past, future], dim=-1))
+        prior, posterior = logits.chunk(2, dim=-1)
+        return self._graph(prior, x), self._graph(posterior, x)
+
+    def _heads(self, both: Tensor) -> Tensor:
+        """Map both hidden states (T, edges, 2 * H) to the logits of prior and posterior (T, edges, 2 * K)."""
+        return torch.cat([self.prior_head(both[..., : self.past.hidden_size]), self.posterior_head(both)], dim=-1)
 
     def prior(self, x: Tensor, memory: Memory | None = None) -> tuple[Tensor, Memory]:
         """Return the logits (B, T, N, N, K) of the prior alone, for prediction, and the memory after the last step.
@@ -229,13 +271,10 @@ class DynamicEncoder(nn.Module):
         """
         sequences = self.embedding(x.transpose(0, 1)).tensor().flatten(1, 3)
         past, memory = remember(self.past.all_weights[0], sequences, memory)
-        return self._logits(self.prior_head, past, x), memory
+        return self._graph(self.prior_head(past), x), memory
 
-    def _logits(self, head: nn.Sequential, sequences: Tensor, x: Tensor) -> Tensor:
-        """Apply a head to sequences (T, B * N * (N - 1), H), as many steps at a time as fit into the processor's cache,
-        and arrange its logits as (B, T, N, N, K).
-        """
+    @staticmethod
+    def _graph(logits: Tensor, x: Tensor) -> Tensor:
+        """Arrange logits (T, B * N * (N - 1), K) as (B, T, N, N, K); x is (B, T, N, F)."""
         b, t, n, _ = x.shape
-        steps_at_a_time = max(CHUNK // (b * n * n * self.head_size), 1)
-        logits = torch.cat([head(steps) for steps in torch.split(sequences, steps_at_a_time)])
         return edge_graph(logits.view(t, b, n, n - 1, logits.shape[-1]).transpose(0, 1))

@@ -25,10 +25,7 @@ class Block:
         padding = -sum(sizes) % ALIGNED
         self.values = tensors[0][0].new_zeros(len(tensors), sum(sizes) + padding)
         pieces = torch.split(self.values, [*sizes, padding], dim=1)[:-1]
-        self.parts = [
-            piece.view(len(tensors), *like.shape)
-            for piece, like in zip(pieces, tensors[0], strict=True)
-        ]
+        self.parts = [piece.view(len(tensors), *like.shape) for piece, like in zip(pieces, tensors[0], strict=True)]
         for seed, own in enumerate(tensors):
             for tensor, part in zip(own, self.parts, strict=True):
                 part[seed].copy_(tensor.detach())

@@ -14,11 +14,12 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import VariationalSpec, required
 from ssmail.envs.integrator import Integrator
+from ssmail.errors import InputError
 from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
-from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder
+from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
 from ssmail.training.cloning import SupervisedLearner
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext, Reading
@@ -36,7 +37,13 @@ class VariationalModel(nn.Module):
         super().__init__()
         self.features, self.spec, self.dynamic = features, spec, dynamic
         inputs, action_size = features.size(state_size), state_size // 2
-        self.encoder = DynamicEncoder(inputs, spec) if dynamic else StaticEncoder(inputs, spec)
+        self.encoder: DynamicEncoder | WindowEncoder | StaticEncoder
+        if dynamic:
+            self.encoder = DynamicEncoder(inputs, spec)
+        elif spec.encoder_window is not None:
+            self.encoder = WindowEncoder(inputs, features.agents, spec)
+        else:
+            self.encoder = StaticEncoder(inputs, spec)
         self.decoder = make_decoder(inputs, action_size, spec)
         self.register_buffer("fixed_prior", fixed_prior(spec.edge_types, spec.none_prior), persistent=False)
         self.graph_noise = GraphNoise("edge", "step" if dynamic else "trajectory")
@@ -58,6 +65,13 @@ class VariationalModel(nn.Module):
         if isinstance(self.encoder, DynamicEncoder):
             return self.encoder.prior(x)[0]
         return self.encoder.running(x)
+
+    def observed_logits(self, states: Tensor) -> Tensor:
+        """Return nri's logits (B, 1, N, N, K) given all states (B, T, N, D), for the graph of a prediction."""
+        if isinstance(self.encoder, WindowEncoder):
+            logits: Tensor = self.encoder(self.read(states))
+            return logits
+        return self.past_logits(states)[:, -1:]
 
     def read(self, states: Tensor) -> Tensor:
         """Return the features (B, T, N, F) that encoder and decoder read of states (B, T, N, D)."""
@@ -106,7 +120,7 @@ class _GraphSampler:
     def __init__(self, model: VariationalModel, observed: Tensor, gumbel: Tensor) -> None:
         self.model, self.gumbel, self.step = model, gumbel, 0
         self.memory: Memory | None = None
-        self.fixed = None if model.dynamic else model.sample(model.past_logits(observed)[:, -1:], gumbel)
+        self.fixed = None if model.dynamic else model.sample(model.observed_logits(observed), gumbel)
 
     def sample(self, states: Tensor) -> Tensor:
         """Return the graphs (B, T or 1, N, N, K) under which to decode the next states (B, T, N, D)."""
@@ -188,6 +202,10 @@ class VariationalLearner(SupervisedLearner):
         self.model = model.to(context.device)
         self.predictor = VariationalPredictor(self.model, context.integrator)
         super().__init__(context, "model", self.model)
+        vectors = self.training.batch * context.experts.states.shape[2]
+        if isinstance(model.encoder, WindowEncoder) and self.variational.batch_norm and vectors == 1:
+            remedy = "set training.batch=2 or variational.batch_norm=false"
+            raise InputError(f"batch norm needs two agents in a batch, and there is one; {remedy}.")
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Take training.updates gradient steps under the curriculum."""
@@ -202,8 +220,10 @@ class VariationalLearner(SupervisedLearner):
     def _update(self, interventions: Tensor) -> dict[str, float]:
         batch = self.context.experts.draw(self.training.batch, self.generators["data"])
         states = batch.states[:, :-1]
-        # Encode: posterior and prior over graphs, and one sample from the posterior.
-        posterior, prior = self.model.posterior(states)
+        # Encode: posterior and prior over graphs, and one sample from the posterior. nri as published reads the whole
+        # window; the other encoders leave out the last state, after which nothing is predicted.
+        whole = isinstance(self.model.encoder, WindowEncoder)
+        posterior, prior = self.model.posterior(batch.states if whole else states)
         noise = self.model.draw_noise(len(batch), states.shape[1], states.shape[2], self.generators["policy"])
         graphs = self.model.sample(posterior, noise.to(self.device))
         # Decode: next states under that graph.
