@@ -154,6 +154,8 @@ class AdversarialSpec(Frozen):
     time_steps: Count
     # standard deviation of the Gaussian noise on the discriminator's training inputs, scaled units
     input_noise: NonNegative
+    # input_noise of the last epoch as a fraction of the first: it falls geometrically, from a coarse to a fine reward
+    input_noise_final: Share
     reward_scale: Positive
     reward_limit: Positive | None  # rewards are clipped to plus or minus this after scaling; null: no clipping
 

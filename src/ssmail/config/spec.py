@@ -48,6 +48,7 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("model", "discriminator_hidden", None),
     ("model", "discriminator_waves", []),
     ("sac", "encoder_steps", None),
+    ("adversarial", "input_noise_final", 1.0),
     ("sac", "expansion_steps", 0),
     ("sac", "average", None),
     ("variational", "encoder_window", None),

@@ -152,6 +152,7 @@ class AdversarialTraining:
         self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
         self.experts, self.device = context.experts, context.device
+        self.input_noise = self.adversarial.input_noise  # of this epoch
         self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
         self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
         self.discriminator, block = stacked_modules([seed.discriminator for seed in seeds])
@@ -175,6 +176,8 @@ class AdversarialTraining:
         for seed, made in zip(self.seeds, latest.of_each(), strict=True):
             seed.replay.add(made)
         replay = Batch.of_seeds([seed.replay.trajectories for seed in self.seeds])
+        final = self.adversarial.input_noise_final ** (epoch / max(self.training.epochs - 1, 1))
+        self.input_noise = self.adversarial.input_noise * final
         # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
         actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
         logs = [self.update(latest, replay, actor_learns=actor_learns) for _ in range(self.training.updates)]
@@ -292,7 +295,7 @@ class AdversarialTraining:
 
     def _add_input_noise(self, inputs: Tensor, features: int | None = None) -> Tensor:
         """Add Gaussian noise to the first `features` inputs (all by default), so that D ignores jitter."""
-        read, std = inputs[..., :features], self.adversarial.input_noise
+        read, std = inputs[..., :features], self.input_noise
         if std == 0:
             return inputs
         noise = drawn(self.generators, "data", lambda g: torch.randn(read.shape[1:], generator=g)).to(self.device)
