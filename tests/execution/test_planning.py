@@ -1,14 +1,19 @@
-"""How long cells take."""
+"""How long cells take, and which share a process."""
 
 import dataclasses
 import json
+import math
+from collections import Counter
+from itertools import chain
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
-from ssmail.execution.planning import estimated_seconds, longest_first, total_seconds
+from ssmail.execution.planning import estimated_seconds, longest_first, shares, total_seconds
 from ssmail.store import RunRow, Store
 
 
@@ -66,3 +71,36 @@ def test_long_and_unknown_cells_come_first() -> None:
     ordered = longest_first(cells, {short: 1.0, long: 2.0, unknown: None, vast: None})
     assert [cell.spec.epochs for cell in ordered] == [4, 4, 3, 3, 2, 2, 1, 1]
     assert [cell.seed for cell in ordered] == [1, 0] * 4
+
+
+TOGETHER = [smoke(), smoke("training.epochs=9"), smoke(method="gail"), smoke(method="wail")]
+APART = [smoke("sac.encoder_steps=5"), smoke(method="bc"), smoke(method="nri"), smoke(method="copy-last")]
+
+
+@given(
+    chosen=st.lists(st.tuples(st.sampled_from(TOGETHER + APART), st.integers(0, 9)), unique=True, max_size=30),
+    jobs=st.integers(1, 6),
+)
+def test_every_cell_has_one_process_and_only_seeds_of_a_spec_share_one(
+    chosen: list[tuple[RunSpec, int]], jobs: int
+) -> None:
+    cells = [Cell(spec, seed) for spec, seed in chosen]
+    divided = shares(cells, jobs)
+    assert all(divided)
+    assert Counter(chain.from_iterable(divided)) == Counter(cells)
+    for share in divided:
+        (spec,) = {cell.spec for cell in share}
+        of_spec = [cell for cell in cells if cell.spec == spec]
+        assert len(share) <= (math.ceil(len(of_spec) / jobs) if spec in TOGETHER else 1)
+        first = of_spec.index(share[0])
+        assert share == of_spec[first : first + len(share)]  # in their order
+    for spec in TOGETHER:
+        assert sum(share[0].spec == spec for share in divided) <= jobs  # all begin at once if there is one spec
+
+
+def test_ten_seeds_on_two_and_on_four_processes_by_hand() -> None:
+    cells = [Cell(TOGETHER[0], seed) for seed in range(10)]
+    assert [len(share) for share in shares(cells, 2)] == [5, 5]
+    assert [len(share) for share in shares(cells, 4)] == [3, 3, 3, 1]
+    assert [len(share) for share in shares([Cell(APART[0], seed) for seed in range(3)], 2)] == [1, 1, 1]
+    assert shares([], 2) == []

@@ -31,7 +31,7 @@ def test_gail_reaches_the_logit_of_the_density_ratio() -> None:
         logits = torch.zeros(2, requires_grad=True)
         optimizer = torch.optim.SGD([logits], lr=2.0)
         for _ in range(400):
-            pair = (logits[generated], logits[expert])
+            pair = (logits[generated].view(-1, 1, 1), logits[expert].view(-1, 1, 1))
             loss, _ = gail_loss(*(reversed(pair) if swapped else pair))
             optimizer.zero_grad()
             loss.backward()

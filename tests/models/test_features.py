@@ -1,5 +1,6 @@
-"""What networks read of an agent: relative positions, the step, the start, and which agent it is."""
+"""What networks read of an agent: relative positions, the step, the start, which agent it is, and waves."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import required
-from ssmail.models.features import Features
+from ssmail.models.discriminator import Discriminator
+from ssmail.models.features import NO_WAVES, Features, Waves
 
 
 def whole(*shape: int, seed: int = 0) -> Tensor:
@@ -128,3 +130,44 @@ def test_actions_are_read_in_the_units_of_velocities_and_come_back() -> None:
     plain = replace(features, normalization=None)
     assert plain.normalize_actions(velocity) is velocity
     assert plain.denormalize_actions(velocity) is velocity
+
+
+def test_waves_of_a_position_by_hand() -> None:
+    """Frequencies 1 and 3 at the position (pi / 2, pi / 6): phases pi / 2, pi / 6, 3 pi / 2 and pi / 2."""
+    x = torch.tensor([[math.pi / 2, math.pi / 6, 7.0]])  # and a feature that is no position
+    waves = Waves(2, (1.0, 3.0))
+    half, root = 0.5, math.sqrt(3) / 2
+    expected = torch.tensor([[*x[0].tolist(), 1, half, -1, 1, 0, root, 0, 0]])
+    torch.testing.assert_close(waves(x), expected, atol=1e-6, rtol=0)
+    assert waves.size == 8
+    other = torch.tensor([[math.pi / 2, math.pi / 6, -7.0]])
+    assert torch.equal(waves(other)[:, 3:], waves(x)[:, 3:])
+    assert not torch.equal(Waves(3, (1.0, 3.0))(other)[:, 3:], Waves(3, (1.0, 3.0))(x)[:, 3:])  # negative control
+
+
+@given(axes=st.integers(1, 3), frequencies=st.lists(st.floats(0.1, 20), max_size=4))
+def test_the_size_of_waves_is_what_they_add(axes: int, frequencies: list[float]) -> None:
+    x, waves = whole(2, 3, 4, 2 * axes), Waves(axes, tuple(frequencies))
+    made = waves(x)
+    assert made.shape == (2, 3, 4, 2 * axes + waves.size)
+    assert torch.equal(made[..., : 2 * axes], x)
+
+
+def test_no_frequencies_add_nothing() -> None:
+    x = whole(2, 3, 4)
+    for waves in (NO_WAVES, Waves(2, ())):
+        assert waves(x) is x
+        assert waves.size == 0
+
+
+def test_the_discriminator_reads_waves_of_positions_and_is_the_plain_one_without() -> None:
+    x, action = whole(2, 3, 4), whole(2, 3, 2)
+
+    def made(*waves: Waves) -> Discriminator:
+        torch.manual_seed(0)
+        return Discriminator(6, 8, *waves)
+
+    plain, waving = made(), made(Waves(2, (1.0,)))
+    assert torch.equal(made(NO_WAVES)(x, action), plain(x, action))
+    assert waving(x, action).shape == plain(x, action).shape
+    assert waving.edges.first.sender.in_features == plain.edges.first.sender.in_features + 4

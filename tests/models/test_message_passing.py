@@ -20,6 +20,8 @@ from ssmail.models.policy import Actor
 SPEC = ModelSpec(
     hidden=8,
     encoder_hidden=6,
+    discriminator_hidden=None,
+    discriminator_waves=(),
     edge_types=3,
     first_type_is_none=True,
     own_input=True,

@@ -182,6 +182,38 @@ def test_resources_add_up_over_resumes(store: Store, writer: RunWriter) -> None:
     assert second.finished > second.started
 
 
+def test_runs_of_one_process_share_its_time(store: Store, spec: RunSpec, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Alone for 5 s; two for 8 s, then three for 30 s, then again one: 5 + 8 / 2 + 30 / 3 + 7. CPU time at half of it.
+
+    A second run, which counts as alone throughout, has all 50 s.
+    """
+    clock = time.monotonic() + 100
+
+    def wait(seconds: float) -> None:
+        nonlocal clock
+        clock += seconds
+
+    monkeypatch.setattr(time, "monotonic", lambda: clock)
+    monkeypatch.setattr(time, "process_time", lambda: clock / 2)
+    shared = store.start_run(spec, 6, dataset_hash=None, device="cpu")
+    whole = store.start_run(spec, 7, dataset_hash=None, device="cpu")
+    wait(5)
+    for runs, seconds in ((2, 8), (3, 30), (1, 7)):
+        shared.share(runs)
+        whole.share(1)
+        wait(seconds)
+    for one in (shared, whole):
+        one.finish(RunState.INTERRUPTED)
+    divided, single = ((row.wall_seconds, row.cpu_seconds) for row in store.runs())
+    assert divided == pytest.approx((5 + 4 + 10 + 7, 2.5 + 2 + 5 + 3.5))
+    assert single == pytest.approx((50, 25))  # negative control
+    again = store.resume_run(shared.run_id, 0)
+    again.share(4)
+    wait(8)
+    again.finish(RunState.FINISHED)
+    assert store.runs()[0].wall_seconds == pytest.approx(26 + 2)
+
+
 def test_who_lost_the_run_to_another_process_writes_no_more(store: Store, writer: RunWriter) -> None:
     writer.epoch(1, {"a": 1.0})
     store.stale_seconds = 0  # the first process was silent and counts as dead

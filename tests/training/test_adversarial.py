@@ -3,7 +3,8 @@ import torch
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import required
-from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
+from ssmail.training.batches import Batch
 from ssmail.training.loop import TrainingLoop
 
 
@@ -11,6 +12,17 @@ def learner(*overrides: str, method: str = "ssail") -> tuple[AdversarialLearner,
     loop = TrainingLoop(build_spec(method, "yjunction", "smoke", overrides), 0)
     assert isinstance(loop.learner, AdversarialLearner)
     return loop.learner, loop
+
+
+def training(*overrides: str, method: str = "ssail") -> AdversarialTraining:
+    """The training of seed 0 alone: tensors have an axis of length 1 in front."""
+    return AdversarialTraining([learner(*overrides, method=method)[0]])
+
+
+def updated(made: AdversarialTraining, latest: Batch | None = None) -> dict[str, torch.Tensor]:
+    """Take an update on tau_G, by default of a new rollout, which is also all that the replay buffer holds."""
+    latest = made.generate(0.0)[0] if latest is None else latest
+    return made.update(latest, latest)
 
 
 def test_learning_rates_go_geometrically_from_first_to_final() -> None:
@@ -35,21 +47,21 @@ def test_learning_rates_go_geometrically_from_first_to_final() -> None:
 
 
 def test_only_states_and_actions_are_blurred() -> None:
-    made, loop = learner("adversarial.input_noise=0.1", "model.time_input=true")
-    x = made.features(loop.experts.states[:, :-1], loop.experts.states[:, 0])
+    made = training("adversarial.input_noise=0.1", "model.time_input=true")
+    x = made.features(made.experts.states[:, :-1], made.experts.states[:, 0]).unsqueeze(0)
     blurred = made._add_input_noise(x, features=4)
     torch.testing.assert_close(blurred[..., 4:], x[..., 4:], rtol=0, atol=0)
     assert float((blurred - x)[..., :4].std()) == pytest.approx(0.1, rel=0.05)
-    sharp, _ = learner("adversarial.input_noise=0")
+    sharp = training("adversarial.input_noise=0")
     assert torch.equal(sharp._add_input_noise(x, features=4), x)
 
 
 def test_tau_alpha_lies_between_its_pair() -> None:
-    made, loop = learner("self_supervision.alpha=[0.5,0.5]")
+    made = training("self_supervision.alpha=[0.5,0.5]")
     generated, _ = made.generate(0.0)
     mixed, alpha = made._mixed(generated, required(made.supervision), "start")
-    assert alpha.tolist() == [0.5] * len(generated)
-    expert = loop.experts[generated.source]
+    assert alpha.tolist() == [[0.5] * generated.count]
+    expert = made.experts[generated.source]
     torch.testing.assert_close(mixed.states, (generated.states + expert.states) / 2)
     torch.testing.assert_close(mixed.actions, (generated.actions + expert.actions) / 2)
 
@@ -57,21 +69,19 @@ def test_tau_alpha_lies_between_its_pair() -> None:
 def test_d_is_trained_on_the_label_of_alpha() -> None:
     """With every alpha 1.5 and D the constant 0, the self-supervised term is the label's square: 1.5 or 0."""
     for label, term in (("identity", 2.25), ("zero-above-one", 0.0), ("[[0,0],[1,1],[2,0]]", 0.25)):
-        made, _ = learner("self_supervision.alpha=[1.5,1.5]", f"self_supervision.label={label}")
+        made = training("self_supervision.alpha=[1.5,1.5]", f"self_supervision.label={label}")
         for parameter in list(made.discriminator.head.parameters())[-2:]:
             torch.nn.init.zeros_(parameter)
         latest, _ = made.generate(0.0)
-        made.replay.add(latest)
-        assert made._update_discriminator(latest)["discriminator/self_supervised"] == pytest.approx(term)
+        terms = made._update_discriminator(latest, latest)
+        assert terms["discriminator/self_supervised"].tolist() == [pytest.approx(term)]
 
 
 def test_targets_follow_and_only_the_critic_learns_from_its_loss() -> None:
     """After one update the target critic has gone `polyak` of the way, and gradients are on again everywhere."""
-    made, _ = learner("sac.polyak=0.25")
-    latest, _ = made.generate(0.5)
-    made.replay.add(latest)
+    made = training("sac.polyak=0.25")
     before = [p.clone() for p in made.actor_critic.target_critic.parameters()]
-    made.update(latest)
+    updated(made, made.generate(0.5)[0])
     for old, target, source in zip(
         before, made.actor_critic.target_critic.parameters(), made.actor_critic.critic.parameters(), strict=True
     ):
@@ -82,17 +92,15 @@ def test_targets_follow_and_only_the_critic_learns_from_its_loss() -> None:
 
 def test_the_temperature_is_fixed_or_learned() -> None:
     for automatic in (True, False):
-        made, _ = learner(f"sac.automatic_temperature={str(automatic).lower()}", "sac.temperature=0.1")
-        latest, _ = made.generate(0.0)
-        made.replay.add(latest)
-        made.update(latest)
+        made = training(f"sac.automatic_temperature={str(automatic).lower()}", "sac.temperature=0.1")
+        updated(made)
         moved = abs(float(made.actor_critic.temperature) - 0.1) > 1e-6
         assert moved is automatic
 
 
 def test_methods_differ_only_in_what_the_discriminator_is_taught() -> None:
     """Same seed: the same weights, the same first tau_G and the same temperature; then their own terms."""
-    made = {method: learner(method=method)[0] for method in ("ssail", "gail", "wail")}
+    made = {method: training(method=method) for method in ("ssail", "gail", "wail")}
     latest = {method: one.generate(0.0)[0] for method, one in made.items()}
     for method in ("gail", "wail"):
         assert torch.equal(latest[method].states, latest["ssail"].states)
@@ -100,8 +108,7 @@ def test_methods_differ_only_in_what_the_discriminator_is_taught() -> None:
             assert torch.equal(p, q)
     terms = {}
     for method, one in made.items():
-        one.replay.add(latest[method])
-        terms[method] = {name for name in one.update(latest[method]) if name.startswith("discriminator/")}
+        terms[method] = {name for name in updated(one, latest[method]) if name.startswith("discriminator/")}
     both = {"discriminator/loss", "discriminator/generated", "discriminator/expert"}
     assert terms == {
         "ssail": both | {"discriminator/self_supervised"},
@@ -112,20 +119,17 @@ def test_methods_differ_only_in_what_the_discriminator_is_taught() -> None:
 
 def test_actor_critic_of_gail_and_wail_learns_from_generated_trajectories_only() -> None:
     for method, mixes in (("ssail", True), ("gail", False), ("wail", False)):
-        made, _ = learner(method=method)
+        made = training(method=method)
         latest, _ = made.generate(0.0)
-        made.replay.add(latest)
-        batch = made._actor_batch()
-        generated = [any(torch.equal(row, kept) for kept in latest.states) for row in batch.states]
+        batch = made._actor_batch(latest)
+        generated = [any(torch.equal(row, kept) for kept in latest.states[0]) for row in batch.states[0]]
         assert all(generated) is not mixes
 
 
 def test_clipping_bounds_the_critic_and_the_penalty_does_not() -> None:
     for constraint, bounded in (("clipping", True), ("penalty", False)):
-        made, _ = learner(f"wasserstein.constraint={constraint}", "wasserstein.clip=0.01", method="wail")
-        latest, _ = made.generate(0.0)
-        made.replay.add(latest)
-        values = made.update(latest)
+        made = training(f"wasserstein.constraint={constraint}", "wasserstein.clip=0.01", method="wail")
+        values = updated(made)
         assert ("discriminator/penalty" in values) is not bounded
         largest = max(float(p.detach().abs().max()) for p in made.discriminator.parameters())
         assert (largest <= 0.01) is bounded
@@ -147,25 +151,24 @@ def test_the_actor_waits_for_its_start_while_its_judges_learn() -> None:
         for epoch, moves in enumerate(moving):
             parts = (made.actor_critic.policy, made.actor_critic.critic, made.discriminator)
             before = [[p.clone() for p in part.parameters()] for part in parts]
-            temperature = made.actor_critic.temperature.clone()
+            temperature = made.actor_critic.log_temperature.clone()
             made.run_epoch(epoch)
             policy, critic, discriminator = (
                 any(not torch.equal(old, new) for old, new in zip(olds, part.parameters(), strict=True))
                 for olds, part in zip(before, parts, strict=True)
             )
             assert (policy, critic, discriminator) == (moves, True, True)
-            assert torch.equal(temperature, made.actor_critic.temperature) is not moves
+            assert torch.equal(temperature, made.actor_critic.log_temperature) is not moves
 
 
 def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
     """The same graphs and entropy; with as many steps as there are, or null, no gradient is missing."""
-    made, loop = learner("model.graph_noise=edge")
-    x = made.features(loop.experts.states[:4], loop.experts.states[:4, 0])
+    made = training("model.graph_noise=edge")
+    x = made.features(made.experts.states[:4], made.experts.states[:4, 0]).unsqueeze(0)
     policy, results = made.actor_critic.policy, []
     for steps in (None, 5, 10**6):
         made.actor_critic.spec = made.actor_critic.spec.model_copy(update={"encoder_steps": steps})
-        made.generators.load_state_dict(loop.generators.state_dict())
-        made.generators["policy"].manual_seed(1)
+        made.generators[0]["policy"].manual_seed(1)
         graph, entropy = made.actor_critic._graphs(x)
         policy.zero_grad()
         (graph * torch.arange(2.0)).sum().backward(retain_graph=True)

@@ -8,7 +8,7 @@ import torch
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import METHODS, RunSpec
 from ssmail.errors import InputError
-from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
 from ssmail.training.curricula import mean_segment_length
 from ssmail.training.loop import Divergence, TrainingLoop
 from tests.training.conftest import ToySpec
@@ -90,18 +90,19 @@ def test_the_alpha_range_leaves_weights_and_data_order_alone(spec: RunSpec) -> N
     for one, other_one in zip(adversarial(a).networks(), adversarial(b).networks(), strict=True):
         for p, q in zip(one.parameters(), other_one.parameters(), strict=True):
             assert torch.equal(p, q)
-    assert torch.equal(adversarial(a).generate(0.5)[0].states, adversarial(b).generate(0.5)[0].states)
+    first, second = (AdversarialTraining([adversarial(loop)]).generate(0.5)[0] for loop in (a, b))
+    assert torch.equal(first.states, second.states)
 
 
 def test_complete_forcing_keeps_the_expert_states(spec: RunSpec) -> None:
-    learner = adversarial(TrainingLoop(spec, 0))
-    experts, steps = learner.experts, learner.context.steps
-    batch, interventions = learner.generate(1.0)
-    assert mean_segment_length(interventions) == 1
-    torch.testing.assert_close(batch.states[:, :steps], experts.states[batch.source][:, :steps])
-    free, interventions = learner.generate(0.0)
-    assert mean_segment_length(interventions) == steps
-    assert not torch.allclose(free.states[:, steps - 1], experts.states[free.source][:, steps - 1])
+    training = AdversarialTraining([adversarial(TrainingLoop(spec, 0))])
+    experts, steps = training.experts, training.context.steps
+    batch, interventions = training.generate(1.0)
+    assert mean_segment_length(interventions[0]) == 1
+    torch.testing.assert_close(batch.states[..., :steps, :, :], experts.states[batch.source][..., :steps, :, :])
+    free, interventions = training.generate(0.0)
+    assert mean_segment_length(interventions[0]) == steps
+    assert not torch.allclose(free.states[:, :, steps - 1], experts.states[free.source][:, :, steps - 1])
 
 
 def test_metrics_and_arrays_have_their_names_and_shapes(spec: RunSpec) -> None:

@@ -47,7 +47,7 @@ def affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         single = (x.flatten(1, -2) * weight).sum(dim=-1, keepdim=True)
         return (single if bias is None else single + bias.unsqueeze(1)).view(*x.shape[:-1], 1)
     made: Tensor = BatchedProduct.apply(x.flatten(1, -2), weight, bias)  # type: ignore[no-untyped-call]  # torch's
-    return made.view(*x.shape[:-1], -1)
+    return made.view(*x.shape[:-1], weight.shape[1])  # not -1, which a single agent, without edges, leaves open
 
 
 class Linear(nn.Linear):

@@ -52,7 +52,7 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     if the file cannot be written.
     """
     content = io.BytesIO()
-    torch.save(state, content)  # into memory first: on a full disk torch raises errors of its own
+    torch.save(_copied(state), content)  # into memory first: on a full disk torch raises errors of its own
     try:
         with atomic_write(path) as partial:
             partial.write_bytes(content.getbuffer())
@@ -60,6 +60,15 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
         raise InputError(
             f"cannot write the checkpoint {path} ({error.strerror}); free or choose another place"
         ) from error
+
+
+def _copied(state: Any) -> Any:
+    """Return the nested values with copies of the tensors: of a view, torch.save would write all that it is part of."""
+    if isinstance(state, Tensor):
+        return state.detach().clone(memory_format=torch.contiguous_format)
+    if isinstance(state, Mapping):
+        return {key: _copied(value) for key, value in state.items()}
+    return [_copied(value) for value in state] if isinstance(state, list) else state
 
 
 def load_checkpoint(path: Path, sha256: str | None = None) -> dict[str, Any]:

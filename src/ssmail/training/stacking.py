@@ -81,7 +81,8 @@ class StackedAdam:
             for name, seeds in moments.items():
                 seeds.append([state[name] for state in states[-1]])
         joint = self.joint.state[self.weights]
-        joint["step"] = states[0][0]["step"].clone()
+        # In checkpoints of older versions, weights that never had a gradient have no moments.
+        joint["step"] = max(state["step"] for state in states[0]).clone()
         for state in (state for own in states for state in own):
             state["step"] = joint["step"]
         for name, seeds in moments.items():
@@ -91,7 +92,9 @@ class StackedAdam:
         """Take a step on `losses` (S,), of which each depends on the weights of its seed alone."""
         seeds, joint = len(self.optimizers), self.weights.grad
         assert joint is not None
-        found = [g.reshape(seeds, -1) for g in torch.autograd.grad(losses.sum(), self.parameters)]
+        # A single agent has no edges, so parts of its networks are without a gradient.
+        gradients = torch.autograd.grad(losses.sum(), self.parameters, allow_unused=True, materialize_grads=True)
+        found = [g.reshape(seeds, -1) for g in gradients]
         torch.cat(found, dim=1, out=joint[:, : sum(g.shape[1] for g in found)])
         norms = torch.linalg.vector_norm(joint, dim=1, keepdim=True)
         joint.mul_((self.gradient_clip / (norms + 1e-6)).clamp(max=1))
