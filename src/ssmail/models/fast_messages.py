@@ -146,9 +146,9 @@ class EdgeLayers(torch.autograd.Function):
     the senders i of each receiver j.
 
     s and r are the two halves of the first layer, applied per agent; e_ij is an optional embedding of the edge. Forward
-    and backward pass do all of this for as many steps as fit into the processor's cache. m is stored for the gradient,
-    h only where it depends on e: otherwise computing it again is cheaper than fetching it. Edges of weight 0 have no
-    part in the gradients of the layers and are left out of their products.
+    and backward pass do all of this for as many steps as fit into the processor's cache. m is stored for the gradient;
+    h is computed again, which costs hardly more than fetching it from memory. Edges of weight 0 have no part in the
+    gradients of the layers and are left out of their products.
     """
 
     @staticmethod
@@ -162,13 +162,13 @@ class EdgeLayers(torch.autograd.Function):
         (H, H) and b (H,). weights: w (B, T, N, N - 1), or None for the mean.
         """
         b, t, n, h = s.shape
-        second, received, first = s.new_empty(b, t, n, n - 1, h), torch.empty_like(s), []
+        second, received = s.new_empty(b, t, n, n - 1, h), torch.empty_like(s)
         squares, near = s.new_zeros(h), None
         for k in chunks(b, t, n * (n - 1) * h):
             # first layer
             hidden, out = first_layer(s[k], r[k]), second[k].flatten(0, 3)
             if edges is not None and edge_weight is not None:
-                first.append(hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t()))
+                hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t())
             # second layer, written into its place in `second`
             torch.addmm(bias, activation.in_place(hidden), weight.t(), out=out)
             activation.in_place(out)
@@ -181,7 +181,7 @@ class EdgeLayers(torch.autograd.Function):
                 torch.sum(second[k] * weights[k].unsqueeze(-1), dim=-2, out=received[k])
         mean = received.mean(dim=(0, 1, 2))
         variance = squares if near is None else squares / (second.numel() // h) - (mean - near).square()
-        ctx.save_for_backward(s, r, second, edges, edge_weight, weight, weights, mean, *first)
+        ctx.save_for_backward(s, r, second, edges, edge_weight, weight, weights, mean)
         ctx.activation = activation
         ctx.set_materialize_grads(False)
         return second, received, variance
@@ -191,7 +191,7 @@ class EdgeLayers(torch.autograd.Function):
         ctx: Any, grad_second: Tensor | None, grad_received: Tensor | None, grad_variance: Tensor | None
     ) -> Any:
         """Return the gradients of s, r, edges, edge_weight, weight, bias and weights."""
-        s, r, second, edges, edge_weight, weight, weights, mean, *first = ctx.saved_tensors
+        s, r, second, edges, edge_weight, weight, weights, mean = ctx.saved_tensors
         b, t, n, _, h = second.shape
         if grad_received is None:
             grad_received = second.new_zeros(b, t, n, h)
@@ -200,7 +200,7 @@ class EdgeLayers(torch.autograd.Function):
         grad_edges, grad_edge_weight = (None if x is None else torch.zeros_like(x) for x in (edges, edge_weight))
         grad_weight, grad_bias = torch.zeros_like(weight), weight.new_zeros(h)
         grad_weights, pairs = (None if weights is None else torch.empty_like(weights)), None
-        for number, k in enumerate(chunks(b, t, n * (n - 1) * h)):
+        for k in chunks(b, t, n * (n - 1) * h):
             # gradient of m: through the sum over senders, the variance, and m itself
             g, m = grad_received[k].unsqueeze(-2), second[k]
             kept = None
@@ -216,12 +216,12 @@ class EdgeLayers(torch.autograd.Function):
                 g = grad_second[k] + g
             # second layer
             g, m = g.expand_as(m).flatten(0, 3), m.flatten(0, 3)
-            hidden = first_layer(s[k], r[k]) if edges is None else first[number]
+            hidden = first_layer(s[k], r[k])
+            if edges is not None and edge_weight is not None:
+                hidden.addmm_(edges[k].flatten(0, 3), edge_weight.t())
             if kept is not None:
                 g, m, hidden = g[kept], m[kept], hidden[kept]
-            g = ctx.activation.gradient(g, m)
-            if edges is None:
-                ctx.activation.in_place(hidden)
+            g, hidden = ctx.activation.gradient(g, m), ctx.activation.in_place(hidden)
             grad_weight.addmm_(g.t(), hidden)
             grad_bias += g.sum(dim=0)
             # first layer
