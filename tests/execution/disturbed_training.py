@@ -4,6 +4,7 @@ import os
 import random
 import signal
 import threading
+from collections.abc import Sequence
 
 from ssmail.training.loop import TrainingLoop
 from tests.execution.fake_loop import wait_until_asked_to_stop
@@ -19,6 +20,16 @@ class Killed(TrainingLoop):
         if self.epoch == LAST_EPOCH:
             threading.Timer(DELAY, os.kill, (os.getpid(), signal.SIGKILL)).start()
         return super().run_epoch()
+
+
+class KilledTogether(TrainingLoop):
+    """Dies as Killed does, with all seeds of its process."""
+
+    @staticmethod
+    def run_epochs(loops: "Sequence[TrainingLoop]") -> Sequence[dict[str, float] | Exception]:
+        if loops[0].epoch == LAST_EPOCH:
+            threading.Timer(DELAY, os.kill, (os.getpid(), signal.SIGKILL)).start()
+        return TrainingLoop.run_epochs(loops)
 
 
 class Interrupted(TrainingLoop):

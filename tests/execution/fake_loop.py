@@ -125,6 +125,13 @@ class Patient(Walk):
         return super().run_epoch()
 
 
+class PatientSeed(Patient):
+    """Seed 3 alone waits."""
+
+    def run_epoch(self) -> dict[str, float]:
+        return super().run_epoch() if self.seed == 3 else Walk.run_epoch(self)
+
+
 class Endless(Walk):
     """An epoch that takes longer than anyone waits."""
 
