@@ -95,8 +95,8 @@ def test_killed_in_the_middle_and_resumed_equals_undisturbed(
 def test_seeds_interrupted_at_different_epochs_catch_up(
     store: Store, spec: RunSpec, undisturbed: dict[int, Any]
 ) -> None:
-    train(cells_of(spec, (0, 1)), store, should_stop=lambda events: events[-1].epoch == 1)
-    train(cells_of(spec, (1,)), store, should_stop=lambda events: events[-1].epoch == 3)
+    train(cells_of(spec, (0, 1)), store, should_stop=lambda events: bool(events) and events[-1].epoch == 1)
+    train(cells_of(spec, (1,)), store, should_stop=lambda events: bool(events) and events[-1].epoch == 3)
     events = train(cells_of(spec), store)
     assert [(event.cell.seed, event.kind, event.epoch) for event in events[:3]] == [
         (0, "resumed", 1),
