@@ -128,6 +128,7 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     assert values["model"].pop("standardize") is False
     assert values["model"].pop("discriminator_waves") == []
     assert values["sac"].pop("expansion_steps") == 0
+    assert values["adversarial"].pop("input_noise_final") == 1
     before = json.dumps(values, sort_keys=True, separators=(",", ":"))
     assert now.hash() == hashlib.sha256(before.encode()).hexdigest()[:16]
     assert '"label":"identity"' in now.as_json()
