@@ -29,6 +29,7 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.plots import style
 from ssmail.training.landscape_recorder import LandscapeRecorder
+from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
 from ssmail.training.loop import TrainingLoop
 
 AGENTS = (3, 5, 10, 20, 30, 50, 100)
@@ -77,6 +78,8 @@ def cpu_ms(work: Callable[[], object]) -> float:
 def updates(loop: TrainingLoop) -> list[float]:
     """Train an epoch and return the CPU milliseconds of each of its updates but the first."""
     learner: Any = loop.learner
+    if isinstance(learner, AdversarialLearner):
+        learner = AdversarialTraining([learner])
     name = "update" if hasattr(learner, "update") else "_update"
     original, taken = getattr(learner, name), []
 

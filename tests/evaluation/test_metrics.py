@@ -193,7 +193,7 @@ def test_distances_of_many_points_are_those_of_each_of_them(monkeypatch: pytest.
     rng = np.random.default_rng(0)
     points, line = rng.normal(size=(5, 3, 2, 2)), rng.normal(size=(4, 2))
     expected = metrics.polyline_distances(points, line)
-    monkeypatch.setattr(metrics, "CHUNK", chunk)
+    monkeypatch.setattr(metrics, "BLOCK", chunk)
     found = metrics.polyline_distances(points, line)
     assert found.shape == (5, 3, 2)
     np.testing.assert_array_equal(found, expected)

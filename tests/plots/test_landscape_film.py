@@ -56,7 +56,7 @@ def test_a_film_has_a_picture_of_each_epoch_and_names_its_run(
 
 def test_runs_that_have_none_say_why(store: Store, add_run: AddRun, add_forecast: AddRun) -> None:
     for run, reason in (
-        (add_run(), "an older ssmail trained it"),
+        (add_run(), "its setting evaluation.landscapes is null"),
         (add_run(method="bc"), r"\(bc\) learns no reward"),
         (add_forecast(), "is on mocap, which is not planar"),
     ):
