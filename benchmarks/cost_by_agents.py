@@ -28,8 +28,8 @@ from torch import Tensor
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.plots import style
-from ssmail.training.landscape_recorder import LandscapeRecorder
 from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
+from ssmail.training.landscape_recorder import LandscapeRecorder
 from ssmail.training.loop import TrainingLoop
 
 AGENTS = (3, 5, 10, 20, 30, 50, 100)
