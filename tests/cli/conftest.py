@@ -8,12 +8,12 @@ import pytest
 
 from ssmail.execution import Resume, local
 from ssmail.execution.cells import Cell, Event, RunSettings
-from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
 from ssmail_cli.main import run
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
 from tests.execution.fake_loop import Walk
+from tests.execution.one_cell import run_cell
 from tests.paper.handmade_arrays import arrays
 
 SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")

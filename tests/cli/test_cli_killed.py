@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from ssmail.execution.cells import Cell, Event, RunSettings
-from ssmail.execution.run_cell import run_cell
 from ssmail.store import Store
 from ssmail.store.maintenance.checks import check
 from ssmail_cli.progress import Report
 from tests.cli.command_line import CommandLine
 from tests.cli.test_cli_reproduce import needs
 from tests.execution.fake_loop import Driver
+from tests.execution.one_cell import run_cell
 
 ROOT = Path(__file__).parents[2]
 DRAW = random.Random(6)

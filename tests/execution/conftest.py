@@ -9,8 +9,8 @@ from ssmail.execution.cells import Cell
 
 @pytest.fixture
 def cells() -> list[Cell]:
-    """Seeds 0 to 3 of a spec of 4 epochs."""
-    spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
+    """Seeds 0 to 3 of a spec of 4 epochs, whose method has each in a process of its own."""
+    spec = build_spec("bc", "yjunction", "smoke", ["training.epochs=4"])
     return [Cell(spec, seed) for seed in range(4)]
 
 

@@ -15,8 +15,8 @@ def tell(event: Event) -> None:
 
 if __name__ == "__main__":
     where, loop, seeds, jobs = sys.argv[1:]
-    spec = build_spec("ssail", "yjunction", "smoke", ["training.epochs=4"])
+    spec = build_spec("bc", "yjunction", "smoke", ["training.epochs=4"])  # each seed has a process of its own
     cells = [Cell(spec, seed) for seed in range(int(seeds))]
     worker = fake_worker(getattr(fake_loop, loop))
-    events = run_cells(cells, store_url=where, on_event=tell, jobs=int(jobs), together=False, worker=worker)
+    events = run_cells(cells, store_url=where, on_event=tell, jobs=int(jobs), worker=worker)
     print("returned", *(event.kind for event in events), flush=True)

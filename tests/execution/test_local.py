@@ -15,10 +15,10 @@ from ssmail.errors import InputError
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.local import run_cells
-from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
 from tests.execution.fake_loop import Accidents, Chatty, Endless, Patient, Slow, Walk
 from tests.execution.fake_worker import fake_worker
+from tests.execution.one_cell import run_cell
 from tests.execution.recorded import recorded
 
 PARENT = Path(__file__).parent / "parent.py"
@@ -34,7 +34,6 @@ def compute(
         events.append(event)
         meanwhile(event)
 
-    how = {"together": False, **how}
     final = run_cells(cells, store_url=store.url, on_event=on_event, worker=fake_worker(loop), **how)
     return final, events
 

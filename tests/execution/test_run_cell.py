@@ -15,13 +15,14 @@ from ssmail.config.experiments import build_spec
 from ssmail.data.expert_sets import save
 from ssmail.data.yjunction import generate
 from ssmail.execution import Resume
-from ssmail.execution import run_cell as module
+from ssmail.execution import run_together as module
 from ssmail.execution.cells import Cell, Event, Job, RunSettings
-from ssmail.execution.run_cell import MakeLoop, run_cell
+from ssmail.execution.run_together import MakeLoop
 from ssmail.store import RunState, RunWriter, Store
 from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
 from ssmail.training.loop import TrainingLoop
 from tests.execution.fake_loop import Crashes, Diverges, OtherData, Walk
+from tests.execution.one_cell import run_cell
 from tests.execution.recorded import recorded
 
 

@@ -12,7 +12,7 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.local import WORKER, run_cells
-from ssmail.execution.run_cell import MakeLoop, run_together
+from ssmail.execution.run_together import MakeLoop, run_together
 from ssmail.store import RunState, Store
 from ssmail.training.loop import TrainingLoop
 from tests.execution.disturbed_training import LAST_EPOCH, KilledTogether
@@ -28,6 +28,12 @@ def spec() -> RunSpec:
     """With a batch of 16, as in all other profiles: see tests/training/test_together.py."""
     overrides = [f"training.epochs={EPOCHS}", "training.batch=16", "sac.average=0.1", "sac.expansion_steps=1"]
     return build_spec("ssail", "yjunction", "smoke", overrides)
+
+
+@pytest.fixture
+def cells(spec: RunSpec) -> list[Cell]:
+    """Seeds 0 to 3 of a spec whose seeds share a process."""
+    return cells_of(spec, range(4))
 
 
 def cells_of(spec: RunSpec, seeds: Sequence[int] = SEEDS) -> list[Cell]:

@@ -23,7 +23,6 @@ import pytest
 
 from ssmail.config.spec import METHODS
 from ssmail.execution.cells import Cell, Event, RunSettings
-from ssmail.execution.run_cell import run_cell
 from ssmail.store import Store
 from ssmail.store.checkpoint_files import STAGING
 from ssmail.store.maintenance.checks import check
@@ -32,6 +31,7 @@ from ssmail_cli.progress import Report
 from tests.cli.test_cli_killed import ROOT, children_of
 from tests.cli.test_cli_reproduce import needs
 from tests.data.mocap.handmade import write_set, write_subject
+from tests.execution.one_cell import run_cell
 from tests.execution.recorded import recorded
 from tests.hostile import harness
 

@@ -10,10 +10,10 @@ import pytest
 from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
 from ssmail.config.spec import RunSpec, spec_hash
 from ssmail.execution.cells import Cell, RunSettings
-from ssmail.execution.run_cell import run_cell
 from ssmail.store import RunState, Store
 from tests.config.experiments_file import SHIPPED, write
 from tests.execution.fake_loop import Walk
+from tests.execution.one_cell import run_cell
 from tests.hostile import harness
 from tests.store.databases import SPEC, add, change
 

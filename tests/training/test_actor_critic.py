@@ -56,7 +56,8 @@ def test_without_expansion_it_is_the_plain_loss() -> None:
     loss, log_prob = setting.loss(lambda x, actions: pytest.fail("asked for a reward"), temperature)
     setting.generators["policy"].manual_seed(3)
     at, sac = setting.at, setting.sac
-    action, expected_log_prob = sac._act(at.x, at.graph, at.velocity)
+    action, expected_log_prob = sac._sample(at.x, at.graph, at.states[..., 2:])
+    action = sac.features.normalize_actions(action)
     assert torch.equal(loss, actor_loss(sac.critic(at.x, action, at.graph), expected_log_prob, temperature))
     assert torch.equal(log_prob, expected_log_prob)
     expanded, _ = Setting(1).loss(always(0.0), temperature)  # negative control

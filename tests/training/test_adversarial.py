@@ -60,7 +60,7 @@ def test_tau_alpha_lies_between_its_pair() -> None:
     made = training("self_supervision.alpha=[0.5,0.5]")
     generated, _ = made.generate(0.0)
     mixed, alpha = made._mixed(generated, required(made.supervision), "start")
-    assert alpha.tolist() == [[0.5] * generated.count]
+    assert alpha.tolist() == [[0.5] * len(generated)]
     expert = made.experts[generated.source]
     torch.testing.assert_close(mixed.states, (generated.states + expert.states) / 2)
     torch.testing.assert_close(mixed.actions, (generated.actions + expert.actions) / 2)
@@ -168,7 +168,7 @@ def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
     policy, results = made.actor_critic.policy, []
     for steps in (None, 5, 10**6):
         made.actor_critic.spec = made.actor_critic.spec.model_copy(update={"encoder_steps": steps})
-        made.generators[0]["policy"].manual_seed(1)
+        made.generators.seeds[0]["policy"].manual_seed(1)
         graph, entropy = made.actor_critic._graphs(x)
         policy.zero_grad()
         (graph * torch.arange(2.0)).sum().backward(retain_graph=True)

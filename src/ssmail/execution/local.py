@@ -40,18 +40,17 @@ def run_cells(
     jobs: int = 1,
     device: str = "cpu",
     resume: Resume = Resume.AUTO,
-    together: bool = True,
     worker: Sequence[str] = WORKER,
 ) -> list[Event]:
     """Compute every cell in at most `jobs` processes, and return the final event of each, in the order of `cells`.
 
-    With `together`, a process trains several seeds of a spec at once where their method can (`planning.shares`).
-
-    `on_event` is called in this process with every event, including final ones. A failing cell does not affect the
-    others. After SIGINT or SIGTERM to this process, every running cell finishes its epoch and is marked interrupted; a
-    second signal kills the workers, which loses only their current epoch. Raises InputError, and computes nothing, when
-    another process is computing one of the cells, when `resume` is REQUIRE and there is nothing to resume, when a label
-    function is broken, or when the first cell cannot start because of its input.
+    Seeds of a spec share a process where their method can train several at once (`planning.shares`). `on_event` is
+    called in this process with every event, including final ones. A failing cell does not affect the others; a process
+    that dies ends all its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell
+    finishes its epoch and is marked interrupted; a second signal kills the workers, which loses only their current
+    epoch. Raises InputError, and computes nothing, when another process is computing one of the cells, when `resume` is
+    REQUIRE and there is nothing to resume, when a label function is broken, or when the first cell cannot start because
+    of its input.
     """
     check_labels(cells)
     store = Store.open(store_url)
@@ -64,7 +63,7 @@ def run_cells(
                 pool.emit(plan.skipped)
             else:
                 waiting.append(cell)
-        pool.waiting = shares(waiting, jobs) if together else [[cell] for cell in waiting]
+        pool.waiting = shares(waiting, jobs)
         with _counted_signals(pool):
             pool.run()
         return [pool.results[cell] for cell in cells]

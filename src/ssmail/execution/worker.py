@@ -10,7 +10,7 @@ import threading
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ssmail.execution.run_cell import MakeLoop
+    from ssmail.execution.run_together import MakeLoop
 
 _STDIN, _STDOUT, _STDERR = 0, 1, 2
 
@@ -28,7 +28,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
     import torch  # imported late: it takes seconds, in which the signals above must be handled already
 
     from ssmail.execution.cells import Event, Job
-    from ssmail.execution.run_cell import run_together
+    from ssmail.execution.run_together import run_together
     from ssmail.store import Store
     from ssmail.training.loop import TrainingLoop
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ssmail.config.sections import VariationalSpec
 from ssmail.models import message_passing
 from ssmail.models.fast_messages import ELU, EdgeLayers, both_ways, by_steps
-from ssmail.models.graph_encoder import Memory, on_diagonal, remember
+from ssmail.models.graph_encoder import EdgeLSTM, Memory, on_diagonal
 
 
 def edge_graph(edges: Tensor) -> Tensor:
@@ -235,8 +235,8 @@ class DynamicEncoder(nn.Module):
     def __init__(self, inputs: int, spec: VariationalSpec) -> None:
         super().__init__()
         self.embedding = EdgeEmbedding(inputs, spec.hidden, spec.batch_norm)
-        self.past = nn.LSTM(spec.hidden, spec.memory)
-        self.future = nn.LSTM(spec.hidden, spec.memory)
+        self.past = EdgeLSTM(spec.hidden, spec.memory)
+        self.future = EdgeLSTM(spec.hidden, spec.memory)
         self.head_size = spec.head
         self.prior_head = edge_type_head(spec.memory, spec)
         self.posterior_head = edge_type_head(2 * spec.memory, spec)
@@ -253,8 +253,8 @@ class DynamicEncoder(nn.Module):
             logits = by_steps(self._heads, both, weights, both.shape[1] * self.head_size)
         else:
             sequences = edges.tensor().flatten(1, 3)  # (T, B * N * (N - 1), H)
-            past, _ = remember(self.past.all_weights[0], sequences, None)
-            future = remember(self.future.all_weights[0], sequences.flip(0), None)[0].flip(0)
+            past, _ = self.past(sequences)
+            future = self.future(sequences.flip(0))[0].flip(0)
             logits = self._heads(torch.cat([past, future], dim=-1))
         prior, posterior = logits.chunk(2, dim=-1)
         return self._graph(prior, x), self._graph(posterior, x)
@@ -270,7 +270,7 @@ class DynamicEncoder(nn.Module):
         the same logits; in training mode, batch norm depends on the steps that are read together.
         """
         sequences = self.embedding(x.transpose(0, 1)).tensor().flatten(1, 3)
-        past, memory = remember(self.past.all_weights[0], sequences, memory)
+        past, memory = self.past(sequences, memory)
         return self._graph(self.prior_head(past), x), memory
 
     @staticmethod

@@ -20,7 +20,7 @@ from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import entries, fitted, load_part
 from ssmail.training.rollout import PolicyPredictor
-from ssmail.training.seeding import Generators, drawn
+from ssmail.training.seeding import Generators, GeneratorsOfSeeds, drawn, normal_like
 from ssmail.training.stacking import Block, StackedAdam, stacked_modules
 
 Reward = Callable[[Tensor, Tensor], Tensor]
@@ -81,13 +81,12 @@ class Transitions:
     x: Tensor  # (S, B, C, N, F)
     actions: Tensor  # (S, B, C, N, A), as the networks read them
     graph: Tensor  # (S, B, C, N, N, K), with gradient
-    velocity: Tensor  # (S, B, C, N, A) before the action
+    states: Tensor  # (S, B, C, N, D)
     next_x: Tensor
     next_graph: Tensor  # detached
     next_velocity: Tensor
     edge_entropy: Tensor  # (S,), nats, means over all steps
     # for what comes after these steps
-    states: Tensor  # (S, B, C, N, D)
     steps: Tensor  # (S, C)
     histories: Tensor  # (S, B, T + 1, N, F) features of the whole trajectories
     graphs: Tensor  # (S, B, T + 1, N, N, K), with gradient
@@ -102,7 +101,7 @@ class SoftActorCritic:
     def __init__(self, seeds: Sequence[ActorCritic], gradient_clip: float) -> None:
         first = seeds[0]
         self.spec, self.features, self.integrator = first.spec, first.actor.features, first.actor.integrator
-        self.generators = [seed.generators for seed in seeds]
+        self.generators = GeneratorsOfSeeds([seed.generators for seed in seeds])
         self.policy: GraphPolicy
         self.critic: TwinCritic
         self.target_critic: TwinCritic
@@ -141,15 +140,15 @@ class SoftActorCritic:
         # Critics: one regression step to r + gamma * (min target Q - temperature * log pi) of the next state.
         with torch.no_grad():
             rewards = reward(at.x, at.actions)
-            next_action, next_log_prob = self._act(at.next_x, at.next_graph, at.next_velocity)
-            next_q = self.target_critic(at.next_x, next_action, at.next_graph)
+            next_action, next_log_prob = self._sample(at.next_x, at.next_graph, at.next_velocity)
+            next_q = self.target_critic(at.next_x, self.features.normalize_actions(next_action), at.next_graph)
             target = critic_target(rewards, next_q, next_log_prob, temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
         self.optimizers["critic"].step(value_loss)
         # Actor and temperature.
         policy_loss, log_prob = self._update_actor(at, temperature, reward, actor_learns)
-        # Target networks.
-        self._update_target()
+        # Target networks and averaged policies.
+        self._update_averages()
         return {
             "critic/loss": value_loss,
             "actor/loss": policy_loss,
@@ -169,17 +168,15 @@ class SoftActorCritic:
         # One pass of the encoder over all T + 1 states gives the graphs at both ends of every transition.
         histories = torch.cat([x, next_x[..., -1:, :, :]], dim=-3)
         graphs, entropy = self._graphs(histories)
-        now = at_steps(states, steps)
         return Transitions(
             x=at_steps(x, steps),
             actions=self.features.normalize_actions(at_steps(batch.actions, steps)),
             graph=at_steps(graphs, steps),
-            velocity=now[..., a:],
+            states=at_steps(states, steps),
             next_x=at_steps(next_x, steps),
             next_graph=at_steps(graphs.detach(), steps + 1),
             next_velocity=at_steps(next_states, steps)[..., a:],
             edge_entropy=entropy,
-            states=now,
             steps=steps,
             histories=histories,
             graphs=graphs,
@@ -192,7 +189,7 @@ class SoftActorCritic:
         that many consecutive steps only. The values do not depend on the window.
         """
         _, b, t, n, _ = history.shape
-        noise = drawn(self.generators, "policy", lambda g: self.policy.draw_graph_noise(b, t, n, g))
+        noise = drawn(self.generators["policy"], lambda g: self.policy.draw_graph_noise(b, t, n, g))
         noise = noise.to(history.device).expand(-1, b, t, -1, -1, -1)
         learned = min(self.spec.encoder_steps or t, t)
         if learned < t:
@@ -206,8 +203,8 @@ class SoftActorCritic:
         For a single seed, because every seed has a window of its own.
         """
         t = history.shape[2]
-        (generator,) = self.generators
-        start = int(torch.randint(t - learned + 1, (), generator=generator["data"]))
+        (generator,) = self.generators["data"]
+        start = int(torch.randint(t - learned + 1, (), generator=generator))
         graphs, logits, memory = [], [], None
         for first, last in ((0, start), (start, start + learned), (start + learned, t)):
             if first < last:
@@ -219,15 +216,10 @@ class SoftActorCritic:
                 logits.append(logit)
         return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2, 3, 4))
 
-    def _act(self, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
-        """Sample actions, as the networks read them, with their log-probabilities."""
-        action, log_prob = self._sample(x, graph, velocity)
-        return self.features.normalize_actions(action), log_prob
-
     def _sample(self, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
         """Sample actions, in scaled units, with their log-probabilities."""
-        noise = drawn(self.generators, "policy", lambda g: torch.randn(velocity.shape[1:], generator=g))
-        return self.policy.actor.sample_with_log_prob(x, graph, velocity, noise.to(velocity.device))
+        noise = normal_like(velocity, self.generators["policy"])
+        return self.policy.actor.sample_with_log_prob(x, graph, velocity, noise)
 
     def _update_actor(
         self, at: Transitions, temperature: Tensor, reward: Reward, learns: bool
@@ -252,26 +244,25 @@ class SoftActorCritic:
         """
         graph, states, read = at.graph, at.states, at.x
         size, last = states.shape[-1], at.graphs.shape[2] - 1
-        earlier, log_probs = torch.zeros_like(at.x[..., 0]), []
-        for k in range(self.spec.expansion_steps + 1):
-            if k:
-                now = (at.steps + k).clamp(max=last)
-                others = at_steps(at.histories, now)[..., size:]
-                read = torch.cat([self.features.normalize_states(states), others], dim=-1)
-                graph = at_steps(at.graphs, now)
+        action, log_prob = self._sample(read, graph, states[..., size // 2 :])
+        first_log_prob, earlier = log_prob, torch.zeros_like(log_prob)
+        for k in range(self.spec.expansion_steps):
+            rewards = reward(read, self.features.normalize_actions(action))
+            earlier = earlier + self.spec.gamma**k * (rewards - temperature * log_prob)
+            states = self.integrator.step(states, action)
+            now = (at.steps + k + 1).clamp(max=last)
+            others = at_steps(at.histories, now)[..., size:]
+            read, graph = torch.cat([self.features.normalize_states(states), others], dim=-1), at_steps(at.graphs, now)
             action, log_prob = self._sample(read, graph, states[..., size // 2 :])
-            log_probs.append(log_prob)
-            as_read = self.features.normalize_actions(action)
-            if k < self.spec.expansion_steps:
-                earlier = earlier + self.spec.gamma**k * (reward(read, as_read) - temperature * log_prob)
-                states = self.integrator.step(states, action)
-        q = self.critic(read, as_read, graph.detach())
+        q = self.critic(read, self.features.normalize_actions(action), graph.detach())
         tail = actor_loss(q, log_prob, temperature)
-        return self.spec.gamma**self.spec.expansion_steps * tail - earlier.mean(dim=PER_SEED), log_probs[0]
+        return self.spec.gamma**self.spec.expansion_steps * tail - earlier.mean(dim=PER_SEED), first_log_prob
 
     @torch.no_grad()
-    def _update_target(self) -> None:
-        """Move the target networks towards the critics by Polyak averaging: target += polyak * (critic - target)."""
+    def _update_averages(self) -> None:
+        """Move the target networks towards the critics, target += polyak * (critic - target), and the averaged policies
+        towards the policies.
+        """
         self.target_values.lerp_(self.critic_values, self.spec.polyak)
         if self.averaged_values is not None and self.spec.average is not None:
             self.averaged_values.lerp_(self.policy_values, self.spec.average)

@@ -33,9 +33,9 @@ from ssmail.training.batches import Batch, ReplayBuffer
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext
-from ssmail.training.optimization import LearningRateSchedule
+from ssmail.training.optimization import LearningRateSchedule, add_noise
 from ssmail.training.rollout import PolicyPredictor
-from ssmail.training.seeding import drawn
+from ssmail.training.seeding import GeneratorsOfSeeds, drawn
 from ssmail.training.stacking import StackedAdam, stacked_modules
 
 
@@ -146,7 +146,7 @@ class AdversarialTraining:
     def __init__(self, seeds: Sequence[AdversarialLearner]) -> None:
         first = seeds[0]
         spec, context = first.context.spec, first.context
-        self.seeds, self.generators = seeds, [seed.generators for seed in seeds]
+        self.seeds, self.generators = seeds, GeneratorsOfSeeds([seed.generators for seed in seeds])
         self.context, self.objective, self.label, self.features = context, first.objective, first.label, first.features
         self.adversarial, self.training = first.adversarial, first.training
         self.curriculum = required(spec.curriculum)
@@ -193,12 +193,12 @@ class AdversarialTraining:
         `frequency` is the curriculum's probability of an intervention per step (trajectory forcing, section 3.3).
         """
         count, steps = self.adversarial.rollouts, self.context.steps
-        starts = self.experts.draw_each(count, self._generators("data"))
-        interventions = drawn(self.generators, "curriculum", lambda g: draw_interventions(count, steps, frequency, g))
+        starts = self.experts.draw(count, self.generators["data"])
+        interventions = drawn(self.generators["curriculum"], lambda g: draw_interventions(count, steps, frequency, g))
         made = self.predictor.rollout(
             starts.states[:, :, :1],
             steps,
-            self._generators("policy"),
+            self.generators["policy"],
             expert=starts.states,
             interventions=interventions.to(self.device) if frequency > 0 else None,
         )
@@ -218,12 +218,12 @@ class AdversarialTraining:
 
     def _update_discriminator(self, latest: Batch, replay: Batch) -> dict[str, Tensor]:
         # tau_G: fresh rollouts, and a share of past ones from the replay buffer. tau_E: the expert's.
-        b, data = self.training.batch, self._generators("data")
+        b, data = self.training.batch, self.generators["data"]
         past = round(b * self.adversarial.past_share)
-        parts = [latest.draw_each(b - past, data)] if past < b else []
+        parts = [latest.draw(b - past, data)] if past < b else []
         if past:
-            parts.append(replay.draw_each(past, data))
-        batches = [Batch.concatenate(parts), self.experts.draw_each(b, data)]
+            parts.append(replay.draw(past, data))
+        batches = [Batch.concatenate(parts), self.experts.draw(b, data)]
         # tau_alpha and its labels (self-supervision).
         labels: tuple[Tensor, ...] = ()
         if self.supervision and self.label:
@@ -242,7 +242,7 @@ class AdversarialTraining:
         # wail bounds D's slope by a gradient penalty, or by clipping its weights.
         if self.wasserstein and self.wasserstein.constraint == "penalty":
             (x_g, x_e), (a_g, a_e) = x.chunk(2, dim=1), actions.chunk(2, dim=1)
-            weight = drawn(self.generators, "data", lambda g: torch.rand(x_g.shape[1:3], generator=g)).to(self.device)
+            weight = drawn(self.generators["data"], lambda g: torch.rand(x_g.shape[1:3], generator=g)).to(self.device)
             penalty = gradient_penalty(self.discriminator, (x_g, a_g), (x_e, a_e), weight)
             terms["penalty"] = self.wasserstein.penalty * penalty
             loss = loss + terms["penalty"]
@@ -259,10 +259,10 @@ class AdversarialTraining:
         With self-supervision, tau_alpha replaces the first self_supervision.actor_share of tau_G: the dynamics are
         affine, so an off-policy critic can learn from the mix (section 3.1.2).
         """
-        generated = replay.draw_each(self.training.batch, self._generators("data"))
+        generated = replay.draw(self.training.batch, self.generators["data"])
         if not self.supervision:
             return generated
-        first, others = generated.split(round(generated.count * self.supervision.actor_share))
+        first, others = generated.split(round(len(generated) * self.supervision.actor_share))
         mixed, _ = self._mixed(first, self.supervision, self.supervision.actor_pairing)
         return Batch.concatenate([mixed, others])
 
@@ -276,31 +276,24 @@ class AdversarialTraining:
             return self.experts[generated.source]
         if pairing == "nearest":
             return self.experts[torch.stack([nearest(made, self.experts.states) for made in generated.states])]
-        candidates = self.experts.draw_each(generated.count, self._generators("data")).of_each()
+        candidates = self.experts.draw(len(generated), self.generators["data"]).of_each()
         pairs = zip(generated.states, candidates, strict=True)
         return Batch.of_seeds([found[assignment(made, found.states)] for made, found in pairs])
 
     def _mixed(self, generated: Batch, supervision: SelfSupervisionSpec, pairing: Pairing) -> tuple[Batch, Tensor]:
         """Mix a batch of tau_G with its expert partners: tau_alpha and alpha (S, B), section 3.1."""
         pieces = supervision.alpha_pieces
-        alpha = drawn(self.generators, "alpha", lambda g: sample_alpha(generated.count, pieces, g)).to(self.device)
+        alpha = drawn(self.generators["alpha"], lambda g: sample_alpha(len(generated), pieces, g)).to(self.device)
         expert = self._pair(generated, pairing)
         states, actions = mix(generated.states, expert.states, alpha), mix(generated.actions, expert.actions, alpha)
         return Batch(states, actions, generated.source), alpha
 
     def _pick_steps(self, steps: int) -> Tensor:
         """Draw the time steps (S, C) of an update in random order: all, or adversarial.time_steps of them."""
-        order = drawn(self.generators, "data", lambda g: torch.randperm(steps, generator=g))
+        order = drawn(self.generators["data"], lambda g: torch.randperm(steps, generator=g))
         return order[:, : self.adversarial.time_steps].to(self.device)
 
     def _add_input_noise(self, inputs: Tensor, features: int | None = None) -> Tensor:
         """Add Gaussian noise to the first `features` inputs (all by default), so that D ignores jitter."""
-        read, std = inputs[..., :features], self.input_noise
-        if std == 0:
-            return inputs
-        noise = drawn(self.generators, "data", lambda g: torch.randn(read.shape[1:], generator=g)).to(self.device)
-        noisy = read + std * noise
+        noisy = add_noise(inputs[..., :features], self.input_noise, self.generators["data"])
         return noisy if features is None else torch.cat([noisy, inputs[..., features:]], dim=-1)
-
-    def _generators(self, purpose: str) -> list[torch.Generator]:
-        return [generators[purpose] for generators in self.generators]

@@ -11,6 +11,7 @@ from torch import Tensor
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import Floats, Trajectories
 from ssmail.training.checkpoint import UnfitState, entries, fitted
+from ssmail.training.seeding import Source, drawn
 
 Arrays = dict[str, np.ndarray]
 """Arrays to store with a run, by name."""
@@ -24,8 +25,7 @@ class Batch:
     actions: (B, T, N, A), taken in states[:, :T].
     source: (B,), the index of the expert trajectory whose start each trajectory shares.
 
-    Batches of S seeds side by side have an axis S in front; `of_seeds` and `draw_each` make them, and `concatenate`
-    joins them.
+    Batches of S seeds side by side have an axis S in front; `of_seeds` and `draw` make them.
     """
 
     states: Tensor
@@ -44,36 +44,26 @@ class Batch:
         )
 
     def __len__(self) -> int:
-        return self.states.shape[0]
+        return self.source.shape[-1]
 
     def __getitem__(self, index: Tensor) -> "Batch":
         return Batch(self.states[index], self.actions[index], self.source[index])
 
-    def draw(self, count: int, generator: torch.Generator) -> "Batch":
-        """Draw `count` trajectories uniformly with replacement."""
-        return self[torch.randint(len(self), (count,), generator=generator).to(self.states.device)]
+    def draw(self, count: int, source: Source) -> "Batch":
+        """Draw `count` trajectories uniformly with replacement.
 
-    @property
-    def count(self) -> int:
-        """B."""
-        return self.source.shape[-1]
-
-    def draw_each(self, count: int, generators: "Sequence[torch.Generator]") -> "Batch":
-        """Draw `count` trajectories for each of S seeds, from its part of this batch or from what all seeds share."""
-        drawn = torch.stack([torch.randint(self.count, (count,), generator=g) for g in generators])
-        drawn = drawn.to(self.states.device)
+        With the generators of S seeds, draw so many for each, from its part of this batch or from what all share.
+        """
+        index = drawn(source, lambda g: torch.randint(len(self), (count,), generator=g)).to(self.states.device)
         if self.source.dim() == 1:
-            return self[drawn]
-        seeds = torch.arange(len(generators), device=drawn.device).unsqueeze(1)
-        return Batch(self.states[seeds, drawn], self.actions[seeds, drawn], self.source[seeds, drawn])
+            return self[index]
+        seeds = torch.arange(len(index), device=index.device).unsqueeze(1)
+        return Batch(*(x[seeds, index] for x in vars(self).values()))
 
     def split(self, count: int) -> "tuple[Batch, Batch]":
         """Return the first `count` trajectories and the others, of every seed."""
-        parts = zip(
-            *(x.split([count, self.count - count], self.source.dim() - 1) for x in vars(self).values()), strict=True
-        )
-        first, others = (Batch(*part) for part in parts)
-        return first, others
+        parts = [x.tensor_split([count], dim=self.source.dim() - 1) for x in vars(self).values()]
+        return Batch(*(first for first, _ in parts)), Batch(*(others for _, others in parts))
 
     def of_each(self) -> "list[Batch]":
         """Return the batch of each seed."""

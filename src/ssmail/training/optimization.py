@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import TrainingSpec
+from ssmail.training.seeding import Source, normal_like
 
 
 def clipped_step(
@@ -18,11 +19,11 @@ def clipped_step(
     optimizer.step()
 
 
-def add_noise(x: Tensor, std: float, generator: torch.Generator) -> Tensor:
+def add_noise(x: Tensor, std: float, source: Source) -> Tensor:
     """Return `x` plus Gaussian noise with standard deviation `std`. Draws nothing for std 0."""
     if std == 0:
         return x
-    return x + std * torch.randn(x.shape, generator=generator).to(x.device)
+    return x + std * normal_like(x, source)
 
 
 def mean_metrics(logs: list[dict[str, float]]) -> dict[str, float]:

@@ -1,6 +1,5 @@
 """Rollouts of a graph policy in the trajectory environment."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Unpack
 
@@ -15,6 +14,7 @@ from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.learner import Reading
+from ssmail.training.seeding import Source, drawn
 
 ENCODER_CHUNK = 10  # observed steps read at once; on recorded motion the edges of all steps together take gigabytes
 
@@ -56,7 +56,7 @@ class PolicyPredictor:
         self,
         observed: Tensor,
         steps: int,
-        generator: torch.Generator | Sequence[torch.Generator],
+        generator: Source,
         *,
         expert: Tensor | None = None,
         interventions: Tensor | None = None,
@@ -74,8 +74,8 @@ class PolicyPredictor:
         policy, (*lead, h, n, _) = self.model, observed.shape
         b, a = lead[-1], policy.action_size
         # Draw all noise up front.
-        graph_noise = _drawn(generator, lambda g: policy.draw_graph_noise(b, steps, n, g)).to(observed.device)
-        action_noise = _drawn(generator, lambda g: torch.randn(steps, b, 1, n, a, generator=g)).to(observed.device)
+        graph_noise = drawn(generator, lambda g: policy.draw_graph_noise(b, steps, n, g)).to(observed.device)
+        action_noise = drawn(generator, lambda g: torch.randn(steps, b, 1, n, a, generator=g)).to(observed.device)
         action_noise = action_noise.movedim(-5, 0)  # (T, B, 1, N, A)
         if deterministic:
             action_noise = torch.zeros_like(action_noise)
@@ -121,8 +121,3 @@ class PolicyPredictor:
         a = self.model.action_size
         no_noise = torch.zeros(b, t, n, a, device=now.device)
         return self.integrator.step(now, self.model.actor.sample(x, graphs, now[..., a:], no_noise))
-
-
-def _drawn(generator: torch.Generator | Sequence[torch.Generator], draw: Callable[[torch.Generator], Tensor]) -> Tensor:
-    """Return the draw of a generator, or those of several side by side."""
-    return draw(generator) if isinstance(generator, torch.Generator) else torch.stack([draw(g) for g in generator])

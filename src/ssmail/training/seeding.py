@@ -37,6 +37,26 @@ class Generators:
             generator.set_state(fitted_generator(state[purpose], generator, f"generators.{purpose}"))
 
 
-def drawn(seeds: Sequence[Generators], purpose: str, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
-    """Return the draws (...) from each seed's generator of that purpose, side by side: (S, ...)."""
-    return torch.stack([draw(seed[purpose]) for seed in seeds])
+Source = torch.Generator | Sequence[torch.Generator]
+"""A generator, or one for each of several seeds, whose draws lie side by side."""
+
+
+class GeneratorsOfSeeds:
+    """The generators of S seeds: those of a purpose, one for each seed."""
+
+    def __init__(self, seeds: Sequence[Generators]) -> None:
+        self.seeds = seeds
+
+    def __getitem__(self, purpose: str) -> list[torch.Generator]:
+        return [seed[purpose] for seed in self.seeds]
+
+
+def drawn(source: Source, draw: Callable[[torch.Generator], Tensor]) -> Tensor:
+    """Return the draw (...) from a generator, or those from S generators, (S, ...)."""
+    return draw(source) if isinstance(source, torch.Generator) else torch.stack([draw(g) for g in source])
+
+
+def normal_like(x: Tensor, source: Source) -> Tensor:
+    """Return standard normal draws of the shape of x, on its device; with S generators, the first axis of x is S."""
+    shape = x.shape if isinstance(source, torch.Generator) else x.shape[1:]
+    return drawn(source, lambda g: torch.randn(shape, generator=g)).to(x.device)

@@ -4,7 +4,7 @@ import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, Protocol
 
@@ -54,25 +54,6 @@ MakeLoop = Callable[[RunSpec, int, str], Loop]
 """Creates a loop from a spec, a seed and a device."""
 
 
-def run_cell(
-    cell: Cell,
-    store: Store,
-    settings: RunSettings,
-    on_event: Callable[[Event], None],
-    should_stop: Callable[[], bool],
-    make_loop: MakeLoop = TrainingLoop,
-) -> Event:
-    """Compute one cell as `run_together` does; return its final event and pass all earlier ones to `on_event`."""
-    events: list[Event] = []
-
-    def keep(event: Event) -> None:
-        (events.append if event.is_final else on_event)(event)
-
-    run_together([cell], store, settings, keep, should_stop, make_loop)
-    (final,) = events
-    return final
-
-
 def run_together(
     cells: Sequence[Cell],
     store: Store,
@@ -100,9 +81,7 @@ def run_together(
         else:
             runs.append(started)
             on_event(started.event("resumed" if started.resumed else "started"))
-    with ExitStack() as stack:
-        for run in runs:
-            stack.enter_context(_heartbeats(run.writer, settings.heartbeat_seconds))
+    with _heartbeats([run.writer for run in runs], settings.heartbeat_seconds):
         _train([run for run in runs if run.attempt(run.record_snapshot, on_event)], on_event, should_stop)
 
 
@@ -183,12 +162,12 @@ class _Run:
 
     def record_epoch(self, outcome: Mapping[str, float] | Exception) -> Event:
         """Store an epoch that has been trained, or how it ended the run."""
-        if isinstance(outcome, Exception) and not isinstance(outcome, Divergence):
-            return self.fail(outcome)
         if isinstance(outcome, Divergence):
             self._record_checkpoints(self._last_name())
             self.writer.finish(RunState.DIVERGED, str(outcome))
             return self.event("diverged", message=str(outcome))
+        if isinstance(outcome, Exception):
+            return self.fail(outcome)
         self.writer.epoch(self.loop.epoch, outcome)
         self.record_snapshot()
         if self.loop.improved:
@@ -262,14 +241,16 @@ def _outcomes(loops: Sequence[Loop]) -> Sequence[Mapping[str, float] | Exception
 
 
 @contextmanager
-def _heartbeats(writer: RunWriter, seconds: float) -> Iterator[None]:
-    """While the block runs, record a heartbeat every `seconds` from another thread, however long an epoch takes."""
+def _heartbeats(writers: Sequence[RunWriter], seconds: float) -> Iterator[None]:
+    """While the block runs, record heartbeats every `seconds` from another thread, however long an epoch takes."""
     done = threading.Event()
 
     def beat() -> None:
         while not done.wait(seconds):
-            with suppress(SsmailError):  # the training thread meets the same error at its next write, and reports it
-                writer.heartbeat()
+            for writer in writers:
+                # the run has ended, or the training thread meets the same error at its next write, and reports it
+                with suppress(SsmailError):
+                    writer.heartbeat()
 
     thread = threading.Thread(target=beat, name="heartbeat", daemon=True)
     thread.start()
