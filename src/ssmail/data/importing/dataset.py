@@ -62,7 +62,7 @@ class ImportOptions:
 def import_set(
     sources: Sequence[Path], options: ImportOptions, report: Callable[[str], None] = lambda _: None
 ) -> tuple[ExpertSet, Summary]:
-    """Make an expert set from files, or from all those in folders. report: is told which file is being read.
+    """Make an expert set from files, or from all those in folders. report: is told of large files.
 
     Raises InputError for anything in the files that cannot be used, and if there is no window for each split.
     """
