@@ -95,7 +95,7 @@ def _parts(tracks: Tracks, rows: Rows, params: SetParameters) -> tuple[list[Wind
     found = np.bincount(cut(tracks, start, frames, stride, least).scene, minlength=len(start))
     by_scene = np.count_nonzero(found) >= len(SPLITS)
     if by_scene:
-        split = split_scenes(rows.scenes, found, params.split)
+        split = np.maximum(split_scenes(rows.scenes, found, params.split), 0)  # of scenes without windows, any
         blocks = [(tracks[split[tracks.scene] == number], start) for number in range(len(SPLITS))]
     else:
         blocks = split_times(tracks, len(start), params.split)
