@@ -41,6 +41,7 @@ CONTENTS = """
 :caption: Use
 
 docs/usage
+docs/data-format
 docs/reference/commands
 docs/extending
 docs/database
