@@ -73,6 +73,13 @@ def import_data(
     split: Annotated[
         str, typer.Option("--split", help="Shares of training, validation and test, split by scene.")
     ] = "70/15/15",
+    validation: Annotated[
+        list[str] | None,
+        typer.Option("--validation", "--val", help="Instead of --split: name or pattern of scenes, repeatable."),
+    ] = None,
+    test: Annotated[
+        list[str] | None, typer.Option("--test", help="With --validation: scenes to test on; the rest is trained on.")
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -96,6 +103,8 @@ def import_data(
         least_agents=least_agents,
         most_agents=agents,
         split=_shares(split),
+        validation=tuple(validation or ()),
+        test=tuple(test or ()),
     )
     expert_sets.check_target(out, force=force)
     experts, summary = import_set(sources, options, note)

@@ -95,7 +95,7 @@ def test_an_existing_file_is_kept(cli: CommandLine, table: Path, tmp_path: Path)
         ("--observed 50", "of a window of 50 frames, 50 cannot be observed; give --observed from 1 to 49"),
         (
             "--window 60",
-            "no three splits can have windows of 60 frames, and one before, with an agent without a gap; the",
+            "the three splits cannot each have windows of 60 frames, and one before, with an agent without a gap; the",
         ),
         ("--x px", "crossing.csv has no column 'px', only scene, frame, agent, x, y; name the one that it is with --x"),
         ("--x '' --y ''", "crossing.csv has no column ''"),

@@ -21,8 +21,8 @@ class SetParameters(Frozen):
     to a forecast, the other `predicted` are compared with it. stride: steps from one window of a scene to the next. dt:
     seconds of a step, if known. identity: whether row n is the same agent in all windows. fill_gaps: missing frames of
     an agent that were interpolated at most. least_agents, most_agents: limits of the agents of a window. split: the
-    shares of training, validation and test. split_by: "scene" if each scene is in one split only; "time" if the frames
-    of a scene were cut into three blocks.
+    shares of training, validation and test. split_by: "scene" if scenes were dealt out by these shares, "name" if they
+    were chosen by their names, "time" if the frames of each scene were cut into three blocks.
     """
 
     environment: Literal["trajectories"] = "trajectories"
@@ -38,7 +38,7 @@ class SetParameters(Frozen):
     least_agents: Count = 1
     most_agents: Count | None = None
     split: tuple[Count, Count, Count] = (70, 15, 15)
-    split_by: Literal["scene", "time"] = "scene"
+    split_by: Literal["scene", "time", "name"] = "scene"
 
     @model_validator(mode="after")
     def _check_lengths(self) -> Self:
@@ -83,7 +83,7 @@ def recorded_set(
             raise ValueError(f"a window of {split} has no agents")
         if any(array.any(where=~found.present) for array in (found.positions, found.velocities)):
             raise ValueError(f"a window of {split} has positions beside those of its agents")
-    if parameters.split_by == "scene":
+    if parameters.split_by != "time":
         for one, other in combinations(SPLITS, 2):
             if shared := used[one] & used[other]:
                 raise ValueError(f"the scene {scenes[min(shared)]!r:.40} is both in {one} and in {other}")

@@ -12,8 +12,13 @@ from ssmail.data.importing import tables
 from ssmail.data.importing.dataset import ImportOptions, import_set
 from ssmail.data.importing.summary import Summary
 from ssmail.data.importing.tables import Columns
+from ssmail.data.mocap.amc import parse_motion
+from ssmail.data.mocap.asf import parse_skeleton
+from ssmail.data.mocap.dataset import MocapParameters, prepare
+from ssmail.data.mocap.kinematics import positions as placed
 from ssmail.data.trajectories import SPLITS, ExpertSet
 from ssmail.errors import InputError
+from tests.data.mocap.handmade import write_subject
 
 SHORT: dict[str, Any] = {"window": 4, "observed": 2}
 
@@ -145,6 +150,42 @@ def test_one_scene_is_cut_by_time(tmp_path: Path) -> None:
     assert not frames[1] & frames[2]
 
 
+def test_scenes_can_be_named(tmp_path: Path) -> None:
+    table_of(walks(scenes=12)).to_csv(tmp_path / "a.csv", index=False)
+    experts, _ = imported(tmp_path / "a.csv", validation=("3",), test=("1?", "5"))
+    scenes = {split: {experts.scenes[scene] for scene in getattr(experts, split).scene} for split in SPLITS}
+    assert (scenes["validation"], scenes["test"]) == ({"3"}, {"10", "11", "5"})
+    assert scenes["train"] == {"0", "1", "2", "4", "6", "7", "8", "9"}
+    for chosen, sentence in {
+        (("3",), ()): "--validation and --test name scenes together; give both, or --split",
+        (("3",), ("30",)): "unknown scene '30'",
+        (("3",), ("*",)): "the scene 3 is named by --validation and by --test; name it once",
+    }.items():
+        with pytest.raises(InputError) as caught:
+            imported(tmp_path / "a.csv", validation=chosen[0], test=chosen[1])
+        assert sentence in str(caught.value)
+
+
+def test_recorded_walking_gives_the_windows_of_mocap(tmp_path: Path) -> None:
+    """The same positions as a table, cut without overlap, with the same trials in the splits."""
+    wanted = MocapParameters(subject=35, train=(1, 2), validation=(3,), test=(4,), window=4, test_window=4)
+    source = write_subject(tmp_path / "subject", {1: 9, 2: 14, 3: 5, 4: 17})
+    mocap = prepare(source, wanted)
+    skeleton = parse_skeleton((source / "35.asf").read_bytes(), "35.asf")
+    tables = []
+    for trial in (1, 2, 3, 4):
+        motion = parse_motion((source / f"35_{trial:02d}.amc").read_bytes(), "amc", skeleton)
+        tables.append(table_of(placed(skeleton, motion)[None]).assign(scene=trial))
+    pd.concat(tables).assign(frame=lambda table: table["frame"] + 1).to_csv(tmp_path / "walking.csv", index=False)
+    experts, _ = imported(tmp_path / "walking.csv", stride=4, validation=("3",), test=("4",))
+    for split in SPLITS:
+        one, other = getattr(experts, split), getattr(mocap, split)
+        np.testing.assert_array_equal([int(experts.scenes[scene]) for scene in one.scene], other.trial)
+        np.testing.assert_array_equal(one.frame, other.frame)
+        np.testing.assert_allclose(one.positions, other.positions, rtol=1e-14)
+        np.testing.assert_allclose(one.velocities, other.velocities, rtol=0, atol=1e-12)
+
+
 def test_what_was_left_out_is_counted(tmp_path: Path) -> None:
     table = table_of(walks(scenes=5, agents=3))
     table = table.drop(table[(table["scene"] == 0) & (table["frame"] == 4) & (table["agent"] == 0)].index)
@@ -222,13 +263,13 @@ FAULTS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a negative frame": (GOOD.replace("0,3,a", "0,-3,a"), "a.csv, line 8: the frame -3 is out of range", {}),
     "too long a window": (
         GOOD,
-        "no three splits can have windows of 50 frames, and one before, with an agent without a gap; the longest "
-        "possible is --window 5",
+        "the three splits cannot each have windows of 50 frames, and one before, with an agent without a gap; the "
+        "longest possible is --window 5",
         {"window": 50, "observed": 25},
     ),
     "too many agents": (
         GOOD,
-        "no three splits can have 3 agents together for 3 frames; raise --fill-gaps",
+        "the three splits cannot each have 3 agents together for 3 frames; raise --fill-gaps",
         {"least_agents": 3},
     ),
     "nothing moves": (

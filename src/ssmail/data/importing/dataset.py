@@ -3,13 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from ssmail.data.importing.cutting import Windows, check_size, cut, longest, nearest
-from ssmail.data.importing.rows import Rows, quoted
+from ssmail.data.importing.rows import quoted
 from ssmail.data.importing.sources import find_files, read_files
-from ssmail.data.importing.splitting import Shares, split_scenes, split_times
+from ssmail.data.importing.splitting import Shares, named_scenes, split_scenes, split_times
 from ssmail.data.importing.summary import Summary, summarize
 from ssmail.data.importing.tables import Columns
 from ssmail.data.importing.tracks import Tracks, make_tracks
@@ -22,7 +23,8 @@ from ssmail.errors import InputError
 class ImportOptions:
     """How rows become windows. observed: of a window, half of it by default. stride: by default what is predicted.
 
-    most_agents: of a window; None for all. The other fields are those of SetParameters.
+    most_agents: of a window; None for all. validation, test: patterns of the names of these scenes, instead of the
+    shares of `split`. The other fields are those of SetParameters.
     """
 
     columns: Columns = field(default_factory=Columns)
@@ -34,6 +36,8 @@ class ImportOptions:
     least_agents: int = 1
     most_agents: int | None = None
     split: Shares = (70, 15, 15)
+    validation: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
 
     def parameters(self, axes: int) -> SetParameters:
         """Return the parameters of a set. Raises InputError unless something of a window is observed and predicted."""
@@ -45,6 +49,8 @@ class ImportOptions:
             )
         if self.most_agents is not None and self.most_agents < self.least_agents:
             raise InputError(f"--agents {self.most_agents} is less than --least-agents {self.least_agents}; swap them")
+        if bool(self.validation) != bool(self.test):
+            raise InputError("--validation and --test name scenes together; give both, or --split")
         return SetParameters(
             axes=axes,
             window=self.window,
@@ -71,7 +77,7 @@ def import_set(
     rows, digests = read_files(files, options.columns, report)
     params = options.parameters(rows.positions.shape[1])
     tracks, repairs = make_tracks(rows, options.dt, options.fill_gaps)
-    parts, params = _parts(tracks, rows, params)
+    parts, params = _parts(tracks, rows.scenes, params, options)
     if params.most_agents is not None:
         parts = [nearest(part, params.most_agents, params.observed) for part in parts]
     agents = max(int(part.agents.max()) for part in parts)
@@ -88,39 +94,48 @@ def import_set(
     return experts, summarize(rows, tracks, repairs, parts, params, len(files))
 
 
-def _parts(tracks: Tracks, rows: Rows, params: SetParameters) -> tuple[list[Windows], SetParameters]:
+def _parts(
+    tracks: Tracks, scenes: Sequence[str], params: SetParameters, options: ImportOptions
+) -> tuple[list[Windows], SetParameters]:
     """Cut the windows of each split, and return them with the parameters that say how it was split."""
     frames, stride, least = params.window + 1, params.stride, params.least_agents
-    start = np.zeros(len(rows.scenes), dtype=np.int64)
-    found = np.bincount(cut(tracks, start, frames, stride, least).scene, minlength=len(start))
-    by_scene = np.count_nonzero(found) >= len(SPLITS)
-    if by_scene:
-        split = np.maximum(split_scenes(rows.scenes, found, params.split), 0)  # of scenes without windows, any
-        blocks = [(tracks[split[tracks.scene] == number], start) for number in range(len(SPLITS))]
+    start = np.zeros(len(scenes), dtype=np.int64)
+    found = np.bincount(cut(tracks, start, frames, stride, least).scene, minlength=len(scenes))
+    split_by: Literal["scene", "time", "name"] = "scene"
+    if options.test:
+        split_by, split = "name", named_scenes(scenes, options.validation, options.test)
+    elif np.count_nonzero(found) >= len(SPLITS):
+        split = np.maximum(split_scenes(scenes, found, params.split), 0)  # of scenes without windows, any
     else:
-        blocks = split_times(tracks, len(start), params.split)
+        split_by = "time"
+    if split_by == "time":
+        blocks = split_times(tracks, len(scenes), params.split)
+    else:
+        blocks = [(tracks[split[tracks.scene] == number], start) for number in range(len(SPLITS))]
     parts = [cut(part, begin, frames, stride, least) for part, begin in blocks]
+    params = params.model_copy(update={"split_by": split_by})
     if not all(map(len, parts)):
         raise _no_window(tracks, blocks, params)
-    return parts, params.model_copy(update={"split_by": "scene" if by_scene else "time"})
+    return parts, params
 
 
 def _no_window(tracks: Tracks, blocks: Sequence[tuple[Tracks, Integers]], params: SetParameters) -> InputError:
     """Return what to say if a split has no window, with the longest that all could have."""
     together = f"{params.least_agents} agents together" if params.least_agents > 1 else "an agent without a gap"
-    scenes = np.sort(longest(tracks, params.least_agents))[::-1]
-    by_scene = int(scenes[len(SPLITS) - 1]) if len(scenes) >= len(SPLITS) else 0
-    by_time = min(int(longest(part, params.least_agents).max(initial=0)) for part, _ in blocks)
-    most = max(by_scene, by_time) - 1
+    most = min(int(longest(part, params.least_agents).max(initial=0)) for part, _ in blocks) - 1
+    if params.split_by == "time" and len(tracks.first) >= len(SPLITS):  # three scenes might have shorter windows
+        most = max(most, int(np.sort(longest(tracks, params.least_agents))[-len(SPLITS)]) - 1)
     if most >= params.window:
         return InputError(
             f"no window of {params.window} frames begins where --stride {params.stride} looks for it; lower --stride"
         )
     if most < 2:
-        return InputError(f"no three splits can have {together} for 3 frames; raise --fill-gaps, or add more scenes")
+        return InputError(
+            f"the three splits cannot each have {together} for 3 frames; raise --fill-gaps, or add more scenes"
+        )
     return InputError(
-        f"no three splits can have windows of {params.window} frames, and one before, with {together}; the longest "
-        f"possible is --window {most}"
+        f"the three splits cannot each have windows of {params.window} frames, and one before, with {together}; the "
+        f"longest possible is --window {most}"
     )
 
 

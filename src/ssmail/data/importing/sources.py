@@ -61,7 +61,7 @@ def read_files(
             with open_regular(file.path) as opened:
                 if (size := os.fstat(opened.fileno()).st_size) >= LARGE:
                     report(f"reading {file.label}, {size / 1e6:,.0f} MB")
-                digests[printable(file.path.as_posix())] = hashlib.file_digest(opened, "sha256").hexdigest()
+                digests[printable(file.scene + file.path.suffix)] = hashlib.file_digest(opened, "sha256").hexdigest()
             suffix = file.path.suffix.lower()
             if suffix in TABLES:
                 TABLES[suffix](file, columns, collector)

@@ -1,13 +1,16 @@
 """The three splits: each scene belongs to one of them; fewer than three scenes are cut into blocks of time."""
 
+import fnmatch
 import hashlib
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
+from ssmail.data.importing.rows import quoted
 from ssmail.data.importing.tracks import Tracks
 from ssmail.data.trajectories import SPLITS, Integers
+from ssmail.errors import InputError, unknown_name
 
 Shares = tuple[int, int, int]
 
@@ -33,6 +36,23 @@ def split_scenes(names: Sequence[str], windows: Integers, shares: Shares) -> Int
         split[scene] = chosen
         lacks[chosen] -= windows[scene]
         empty.discard(chosen)
+    return split
+
+
+def named_scenes(names: Sequence[str], validation: Sequence[str], test: Sequence[str]) -> Integers:
+    """Return the split (scenes,) of each scene: 1 or 2 if its name matches one of the patterns, 0 otherwise.
+
+    Raises InputError for a pattern that no name matches, and for a scene in two splits.
+    """
+    split = np.zeros(len(names), dtype=np.int64)
+    for number, patterns in ((1, validation), (2, test)):
+        for pattern in patterns:
+            matching = [scene for scene, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
+            if not matching:
+                raise unknown_name("scene", pattern, names)
+            if both := next((names[scene] for scene in matching if split[scene] not in (0, number)), None):
+                raise InputError(f"the scene {quoted(both)} is named by --validation and by --test; name it once")
+            split[matching] = number
     return split
 
 
