@@ -1,7 +1,7 @@
 """Flocks as own trajectories: windows of scenes in which 3 to 12 boids fly to one of two goals (tests/data/flock.py).
 
-    python -m tests.data.flocks flocks.npz --numbers 3 12             # the set, with --seed 0
-    ssmail train --env trajectories --set data.path=flocks.npz --seeds 0-2
+python -m tests.data.flocks flocks.npz --numbers 3 12             # the set, with --seed 0
+ssmail train --env trajectories --set data.path=flocks.npz --seeds 0-2
 """
 
 import argparse
@@ -15,28 +15,28 @@ from ssmail.data.recorded_sets import SetParameters, recorded_set, windows
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats
 from tests.data.flock import Rules, fly
 
-FRAMES = 100  # of a scene
+FRAMES, EVERY = 34, 3  # frames of a scene, and steps of the simulation from one to the next
 SHARES = {"train": 0.7, "validation": 0.15, "test": 0.15}
 
 
-def scene(agents: int, axes: int, rng: np.random.Generator, frames: int = FRAMES, rules: Rules | None = None) -> Floats:
+def scene(agents: int, axes: int, rng: np.random.Generator, frames: int = FRAMES) -> Floats:
     """Return the positions (frames, N, P) of a flock that starts near the origin, flies along x and chooses a goal."""
-    rules = rules or Rules(noise=0.02)
+    rules = Rules(noise=0.02)
     positions = rng.uniform(-4, 4, (1, agents, 3))
     velocities = np.array([1.0, 0, 0]) + rng.normal(0, 0.1, positions.shape)
     if axes == 2:
         positions[..., 2] = velocities[..., 2] = 0
-    made = fly(rules, positions, velocities, rng.choice(rules.goals, 1), frames - 1, rng)
-    return made[0, ..., :axes]
+    made = fly(rules, positions, velocities, rng.choice(rules.goals, 1), EVERY * (frames - 1), rng)
+    return made[0, ::EVERY, :, :axes]
 
 
 def generate(
     numbers: Sequence[int] = range(3, 13),
     axes: int = 2,
     scenes: int = 120,
-    window: int = 60,
-    observed: int = 20,
-    stride: int = 13,
+    window: int = 24,
+    observed: int = 8,
+    stride: int = 4,
     seed: int = 0,
     frames: int = FRAMES,
     identity: bool = False,

@@ -116,6 +116,7 @@ def best_of(values: Floats, k: int) -> Floats:
     return least
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def energy_scores(samples: Floats, truth: Floats) -> Floats:
     """Return the energy score (B,) of samples (S, B, T', N, P) of the scaled positions (B, T', N, P).
 

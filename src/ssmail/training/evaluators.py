@@ -67,9 +67,9 @@ class Evaluator(ABC):
         return raw
 
     def draw_training(self) -> Tensor:
-        """Draw the indices of evaluation.train_rollouts training trajectories, anew in every epoch."""
-        count = min(self.spec.train_rollouts, len(self.data.train))
-        return torch.randperm(len(self.data.train), generator=self.generator)[:count]
+        """Draw the indices in `experts` of evaluation.train_rollouts training trajectories, anew in every epoch."""
+        count = min(self.spec.train_rollouts, len(self.context.experts))
+        return torch.randperm(len(self.context.experts), generator=self.generator)[:count]
 
     def sample(
         self, predictor: Predictor, states: Tensor, deterministic: bool = False, samples: int | None = None

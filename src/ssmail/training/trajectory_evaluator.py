@@ -36,8 +36,12 @@ class TrajectoryEvaluator(Evaluator):
         self.validation = data.validation[_evenly(len(data.validation), self.spec.validation_windows)]
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
-        """Forecast validation windows evaluation.validation_samples times, and some training windows once."""
-        train = self.data.train[self.draw_training().numpy()]
+        """Forecast validation windows evaluation.validation_samples times, and some training windows once.
+
+        The training windows have the most common number of agents: each further number costs as many steps again.
+        """
+        common = next(iter(windows_by_number(self.data.train).values()))
+        train = self.data.train[common[self.draw_training().numpy()]]
         values: dict[str, float] = {}
         for split, windows, samples in (
             ("validation", self.validation, self.spec.validation_samples or 1),
