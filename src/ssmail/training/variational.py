@@ -26,7 +26,8 @@ from ssmail.training.curricula import curriculum_metrics, draw_interventions, in
 from ssmail.training.learner import LearnerContext, Reading
 from ssmail.training.optimization import add_noise, mean_metrics
 
-PREDICTION_CHUNK = 16  # trajectories predicted at once
+PREDICTION_CHUNK = 16  # trajectories predicted at once: a skeleton's edges take gigabytes otherwise
+EDGES = PREDICTION_CHUNK * 930  # of the trajectories predicted at once, if their number depends on that of the agents
 
 
 class VariationalModel(nn.Module):
@@ -106,13 +107,10 @@ def evaluation_mode(model: nn.Module) -> Iterator[None]:
         model.train(was_training)
 
 
-def in_chunks(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
-    """Apply a function to PREDICTION_CHUNK rows of the inputs (B, ...) at a time and join the results.
-
-    On recorded motion, 930 edges times the steps of a long history would take gigabytes otherwise.
-    """
-    chunks = zip(*(torch.split(x, PREDICTION_CHUNK) for x in inputs), strict=True)
-    return torch.cat([function(*chunk) for chunk in chunks])
+def in_chunks(function: Callable[..., Tensor], chunk: int, *inputs: Tensor) -> Tensor:
+    """Apply a function to `chunk` rows of the inputs (B, ...) at a time and join the results."""
+    chunks = zip(*(torch.split(x, chunk) for x in inputs), strict=True)
+    return torch.cat([function(*part) for part in chunks])
 
 
 class _GraphSampler:
@@ -135,10 +133,17 @@ class _GraphSampler:
 
 @dataclass(frozen=True)
 class VariationalPredictor:
-    """Samples graphs and predicts the decoder's mean. `deterministic` takes the most likely graph instead."""
+    """Samples graphs and predicts the decoder's mean. `deterministic` takes the most likely graph instead.
+
+    by_edges: predict as many trajectories at once as have EDGES edges, instead of PREDICTION_CHUNK.
+    """
 
     model: VariationalModel
     integrator: Integrator
+    by_edges: bool = False
+
+    def _chunk(self, agents: int) -> int:
+        return max(1, EDGES // max(agents * (agents - 1), 1)) if self.by_edges else PREDICTION_CHUNK
 
     @torch.no_grad()
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
@@ -154,7 +159,9 @@ class VariationalPredictor:
             gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (
                 not reading.get("deterministic")
             )
-            return in_chunks(partial(self._free_run, steps), observed, noise.expand(b, -1, -1, -1), gumbel)
+            return in_chunks(
+                partial(self._free_run, steps), self._chunk(n), observed, noise.expand(b, -1, -1, -1), gumbel
+            )
 
     def _free_run(self, steps: int, observed: Tensor, noise: Tensor, gumbel: Tensor) -> Tensor:
         h = observed.shape[1]
@@ -178,7 +185,7 @@ class VariationalPredictor:
         now = states[:, :-1]
         noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
         with evaluation_mode(self.model):
-            return in_chunks(self._one_step, now, noise)
+            return in_chunks(self._one_step, self._chunk(now.shape[2]), now, noise)
 
     def _one_step(self, now: Tensor, noise: Tensor) -> Tensor:
         graphs = self.model.sample(self.model.past_logits(now), noise)
@@ -203,7 +210,9 @@ class VariationalLearner(SupervisedLearner):
             torch.manual_seed(context.generators.seeds["weights"])
             model = VariationalModel(features, state_size, self.variational, dynamic=spec.method == "dnri")
         self.model = model.to(context.device)
-        self.predictor = VariationalPredictor(self.model, context.integrator)
+        # other chunks may be rounded in another way, and the other environments have stored runs to repeat
+        by_edges = spec.environment == "trajectories"
+        self.predictor = VariationalPredictor(self.model, context.integrator, by_edges)
         super().__init__(context, "model", self.model)
         vectors = self.training.batch * min(batch.states.shape[2] for batch in context.by_number)
         if isinstance(model.encoder, WindowEncoder) and self.variational.batch_norm and vectors == 1:
