@@ -34,7 +34,7 @@ def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, envi
     there = {name for name in OPTIONAL_SECTIONS if getattr(made, name) is not None}
     assert there == set(required_sections(method, environment))
     assert there == {*METHOD_SECTIONS[method], *ENVIRONMENT_SECTIONS[environment]}
-    assert (made.forecast is not None) is (environment == "mocap")
+    assert (made.forecast is not None) is (environment in ("mocap", "trajectories"))
     assert (made.data.yjunction is not None) is (environment == "yjunction")
     assert (made.data.letters is not None) is (environment == "letters")
     assert (made.data.path is not None) is (environment == "mocap")

@@ -38,6 +38,7 @@ SPEC = ModelSpec(
     log_std_min=-5.0,
     log_std_max=0.0,
     root_relative=False,
+    centre_relative=False,
     agent_input=False,
 )
 

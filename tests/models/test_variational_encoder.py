@@ -10,6 +10,7 @@ from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, Win
 
 SPEC = VariationalSpec(
     root_relative=False,
+    centre_relative=False,
     agent_input=False,
     standardize=False,
     hidden=8,

@@ -20,12 +20,14 @@ from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
+from ssmail.training.batches import Batch
 from ssmail.training.cloning import SupervisedLearner
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext, Reading
 from ssmail.training.optimization import add_noise, mean_metrics
 
-PREDICTION_CHUNK = 16  # trajectories predicted at once
+PREDICTION_CHUNK = 16  # trajectories predicted at once: a skeleton's edges take gigabytes otherwise
+EDGES = PREDICTION_CHUNK * 930  # of the trajectories predicted at once, if their number depends on that of the agents
 
 
 class VariationalModel(nn.Module):
@@ -105,13 +107,10 @@ def evaluation_mode(model: nn.Module) -> Iterator[None]:
         model.train(was_training)
 
 
-def in_chunks(function: Callable[..., Tensor], *inputs: Tensor) -> Tensor:
-    """Apply a function to PREDICTION_CHUNK rows of the inputs (B, ...) at a time and join the results.
-
-    On recorded motion, 930 edges times the steps of a long history would take gigabytes otherwise.
-    """
-    chunks = zip(*(torch.split(x, PREDICTION_CHUNK) for x in inputs), strict=True)
-    return torch.cat([function(*chunk) for chunk in chunks])
+def in_chunks(function: Callable[..., Tensor], chunk: int, *inputs: Tensor) -> Tensor:
+    """Apply a function to `chunk` rows of the inputs (B, ...) at a time and join the results."""
+    chunks = zip(*(torch.split(x, chunk) for x in inputs), strict=True)
+    return torch.cat([function(*part) for part in chunks])
 
 
 class _GraphSampler:
@@ -134,10 +133,17 @@ class _GraphSampler:
 
 @dataclass(frozen=True)
 class VariationalPredictor:
-    """Samples graphs and predicts the decoder's mean. `deterministic` takes the most likely graph instead."""
+    """Samples graphs and predicts the decoder's mean. `deterministic` takes the most likely graph instead.
+
+    by_edges: predict as many trajectories at once as have EDGES edges, instead of PREDICTION_CHUNK.
+    """
 
     model: VariationalModel
     integrator: Integrator
+    by_edges: bool = False
+
+    def _chunk(self, agents: int) -> int:
+        return max(1, EDGES // max(agents * (agents - 1), 1)) if self.by_edges else PREDICTION_CHUNK
 
     @torch.no_grad()
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
@@ -153,7 +159,9 @@ class VariationalPredictor:
             gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (
                 not reading.get("deterministic")
             )
-            return in_chunks(partial(self._free_run, steps), observed, noise.expand(b, -1, -1, -1), gumbel)
+            return in_chunks(
+                partial(self._free_run, steps), self._chunk(n), observed, noise.expand(b, -1, -1, -1), gumbel
+            )
 
     def _free_run(self, steps: int, observed: Tensor, noise: Tensor, gumbel: Tensor) -> Tensor:
         h = observed.shape[1]
@@ -177,7 +185,7 @@ class VariationalPredictor:
         now = states[:, :-1]
         noise = self.model.draw_noise(len(now), now.shape[1], now.shape[2], generator).to(now.device)
         with evaluation_mode(self.model):
-            return in_chunks(self._one_step, now, noise)
+            return in_chunks(self._one_step, self._chunk(now.shape[2]), now, noise)
 
     def _one_step(self, now: Tensor, noise: Tensor) -> Tensor:
         graphs = self.model.sample(self.model.past_logits(now), noise)
@@ -194,15 +202,19 @@ class VariationalLearner(SupervisedLearner):
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
         self.variational, self.curriculum = required(spec.variational), required(spec.curriculum)
-        features = Features.of(self.variational, context.experts.states)
+        assert self.variational.variance is not None  # resolved by then
+        self.variance = self.variational.variance
+        features = Features.of(self.variational, *(batch.states for batch in context.by_number))
         state_size = context.experts.states.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(context.generators.seeds["weights"])
             model = VariationalModel(features, state_size, self.variational, dynamic=spec.method == "dnri")
         self.model = model.to(context.device)
-        self.predictor = VariationalPredictor(self.model, context.integrator)
+        # other chunks may be rounded in another way, and the other environments have stored runs to repeat
+        by_edges = spec.environment == "trajectories"
+        self.predictor = VariationalPredictor(self.model, context.integrator, by_edges)
         super().__init__(context, "model", self.model)
-        vectors = self.training.batch * context.experts.states.shape[2]
+        vectors = self.training.batch * min(batch.states.shape[2] for batch in context.by_number)
         if isinstance(model.encoder, WindowEncoder) and self.variational.batch_norm and vectors == 1:
             remedy = "set training.batch=2 or variational.batch_norm=false"
             raise InputError(f"batch norm needs two agents in a batch, and there is one; {remedy}.")
@@ -214,11 +226,14 @@ class VariationalLearner(SupervisedLearner):
         batch, steps, updates = self.training.batch, self.context.steps, self.training.updates
         curriculum = self.generators["curriculum"]
         interventions = [draw_interventions(batch, steps, frequency, curriculum) for _ in range(updates)]
-        logs = [self._update(mask) for mask in interventions]
+        turns = self.context.turns(epoch, updates)
+        logs = [
+            self._update(self.context.by_number[turn], mask) for turn, mask in zip(turns, interventions, strict=True)
+        ]
         return mean_metrics(logs) | curriculum_metrics(frequency, interventions)
 
-    def _update(self, interventions: Tensor) -> dict[str, float]:
-        batch = self.context.experts.draw(self.training.batch, self.generators["data"])
+    def _update(self, experts: Batch, interventions: Tensor) -> dict[str, float]:
+        batch = experts.draw(self.training.batch, self.generators["data"])
         states = batch.states[:, :-1]
         # Encode: posterior and prior over graphs, and one sample from the posterior. nri as published reads the whole
         # window; the other encoders leave out the last state, after which nothing is predicted.
@@ -234,7 +249,7 @@ class VariationalLearner(SupervisedLearner):
             batch.states[:, 1:],
             posterior,
             prior,
-            variance=self.variational.variance,
+            variance=self.variance,
             kl_weight=self.variational.kl_weight,
         )
         self.step(loss)

@@ -1,0 +1,122 @@
+"""Runs on own trajectories: a small set with two, three and four agents in two axes."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import METHODS, RunSpec
+from ssmail.data import expert_sets
+from ssmail.errors import InputError
+from ssmail.training.loop import TrainingLoop
+from ssmail.training.trajectory_evaluator import TrajectoryEvaluator
+from tests.data.flocks import generate
+from tests.execution.recorded import plain
+from tests.training.test_together import numbers, together
+
+SMALL = ("evaluation.train_rollouts=4", "evaluation.validation_samples=2")
+SHORT = ("training.epochs=2", "training.updates=4")
+BASELINES = ("constant-velocity", "copy-last")
+Make = Callable[..., RunSpec]
+
+
+@pytest.fixture(scope="module")
+def make(tmp_path_factory: pytest.TempPathFactory) -> Make:
+    """make("dnri", "forecast.noise=0.1") -> the spec of a run of a second: 4 frames observed, 5 predicted."""
+    path = tmp_path_factory.mktemp("own") / "flocks.npz"
+    expert_sets.save(generate([2, 3, 4], scenes=24, window=9, observed=4, frames=14), path)
+
+    def spec(method: str, *overrides: str) -> RunSpec:
+        short = () if method in BASELINES else SHORT
+        return build_spec(method, "trajectories", "smoke", [f"data.path={path}", *SMALL, *short, *overrides])
+
+    return spec
+
+
+def trained(spec: RunSpec, seed: int = 0) -> TrainingLoop:
+    loop = TrainingLoop(spec, seed)
+    while loop.epoch < spec.epochs:
+        loop.run_epoch()
+    return loop
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_trains_with_any_number_of_agents(make: Make, method: str) -> None:
+    loop = trained(make(method, "forecast.collision_distance=0.5", "forecast.noise=0.05"))
+    values, arrays = loop.final_evaluation()
+    assert all(np.isfinite(value) for value in values.values())
+    for prefix in ("test", "test_mean", "test_last", "test_constant_velocity", "test_copy_last", "test_noisy"):
+        assert values[f"{prefix}/min_fde_1"] == pytest.approx(values[f"{prefix}/fde"])
+        assert 0 <= values[f"{prefix}/collisions"] <= 1
+        assert 0 <= values[f"{prefix}/coverage"] <= 1
+        assert arrays[f"{prefix}/mse"].shape == (5,)
+    if method in BASELINES:
+        for name in ("fde", "energy", "mse_last", "coverage"):
+            assert values[f"test/{name}"] == pytest.approx(values[f"test_{method.replace('-', '_')}/{name}"])
+
+
+@pytest.mark.parametrize("curriculum", ["trajectory-forcing", "teacher-forcing", "scheduled-sampling"])
+def test_every_curriculum_moves_groups_of_their_own_number(make: Make, curriculum: str) -> None:
+    for method in ("ssail", "dnri"):
+        loop = TrainingLoop(make(method, f"curriculum.name={curriculum}", "curriculum.beta=0.5"), 0)
+        assert loop.run_epoch()["curriculum/intervention_frequency"] > 0
+
+
+def test_the_kept_windows_are_those_of_the_set(make: Make) -> None:
+    loop = trained(make("dnri"))
+    assert isinstance(loop.evaluator, TrajectoryEvaluator)
+    _, arrays = loop.final_evaluation()
+    test = loop.data.test
+    kept = np.linspace(0, len(test) - 1, 6).round().astype(int)
+    assert test.agents is not None
+    np.testing.assert_array_equal(arrays["test/agents"], test.agents[kept])
+    np.testing.assert_allclose(arrays["test/observed"], test.positions[kept, :4], rtol=1e-6)
+    np.testing.assert_allclose(arrays["test/future"], test.positions[kept, 4:], rtol=1e-6)
+    samples = arrays["test/samples"]
+    assert samples.shape == (3, 6, 5, 4, 2)
+    for window, agents in enumerate(test.agents[kept].tolist()):
+        assert not samples[:, window, :, agents:].any()  # padding
+        step = np.abs(samples[:, window, 0, :agents] - test.positions[kept[window], 3, :agents])
+        assert 0 < step.max() < 10  # the first predicted position is near the last observed one
+
+
+@pytest.mark.parametrize("method", ["ssail", "nri"])
+def test_a_resumed_run_equals_an_uninterrupted_one(make: Make, method: str) -> None:
+    spec = make(method)
+    loop = TrainingLoop(spec, 0)
+    loop.run_epoch()
+    other = TrainingLoop(spec, 0)
+    other.load_state_dict(loop.state_dict())
+    assert numbers(other.run_epoch()) == numbers(loop.run_epoch())
+    assert plain(other.state_dict()) == plain(loop.state_dict())
+    assert other.final_evaluation()[0] == loop.final_evaluation()[0]
+
+
+def test_seeds_trained_together_equal_seeds_trained_alone(make: Make) -> None:
+    spec = make("ssail", "training.batch=16")
+    loops = [TrainingLoop(spec, seed) for seed in (0, 1)]
+    alone = [together([TrainingLoop(spec, seed)])[0] for seed in (0, 1)]
+    assert together(loops) == alone
+
+
+def test_rare_numbers_get_their_turns_too(make: Make) -> None:
+    loop = TrainingLoop(make("bc"), 0)
+    context = loop.evaluator.context
+    assert {batch.states.shape[2] for batch in context.by_number} == {2, 3, 4}
+    assert set(context.turns(0, 4)) == {0, 1, 2}
+    assert context.turns(0, 4) + context.turns(1, 4) == context.turns(0, 8)
+
+
+def test_windows_that_are_too_short_for_the_forecast_are_an_error(make: Make) -> None:
+    with pytest.raises(InputError, match=r"forecast\.observed 4 and forecast\.predicted 6 need 10 frames.* have 9"):
+        TrainingLoop(make("bc", "forecast.predicted=6"), 0)
+
+
+def test_a_single_agent_can_be_trained_on(tmp_path: Path) -> None:
+    path = tmp_path / "alone.npz"
+    expert_sets.save(generate([1, 2], scenes=24, window=9, observed=4, frames=14), path)
+    for method in ("ssail", "dnri", "nri"):
+        loop = trained(build_spec(method, "trajectories", "smoke", [f"data.path={path}", *SMALL, *SHORT]))
+        assert np.isfinite(loop.final_evaluation()[0]["test/energy"])
