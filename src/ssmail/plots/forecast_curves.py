@@ -1,15 +1,17 @@
 """The error of forecasts against the predicted step, of any methods on one data set: `ssmail plot forecast`.
 
-The error is the array `test/mse` of the best-validation model with its policy sampled: at each predicted step, the mean
-squared error over test windows, samples, agents and features (position and velocity), in squared scaled units. Thin
-lines are seeds; the thick line and the band are centre and spread over **all** runs of a method
+The error is an array of the best-validation model with its policy sampled, a mean over test windows, samples and agents
+at each predicted step: `test/mse`, the squared error of all features (position and velocity) in squared scaled units,
+or `test/distance`, the distance between predicted and true position in the units of the data.
+
+Thin lines are seeds; the thick line and the band are centre and spread over **all** runs of a method
 (`ssmail.evaluation.statistics`). A diverged run counts as infinite at every step: it is a cross at the top edge. The
 references, constant velocity and a copy of the last state, are medians over the runs; those on one data set agree.
 
 The scale is logarithmic where the values span a large factor (`curves.calls_for_logarithm`), else linear from 0.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,10 +21,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ssmail.data.trajectories import Floats
+from ssmail.errors import unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band
-from ssmail.plots.data_sets import ERRORS, DataSet
+from ssmail.plots.data_sets import DataSet
 from ssmail.plots.formatting import number
 from ssmail.plots.metric_units import label
 from ssmail.plots.provenance import Provenance
@@ -30,16 +33,18 @@ from ssmail.plots.run_groups import Selection, tested_alike
 from ssmail.store import RunRow, RunState, Store
 
 NAME = "forecast"
-REFERENCES = {"constant velocity": "test_constant_velocity/mse", "copy-last": "test_copy_last/mse"}
+MSE, DISTANCE = "mse", "distance"
+REFERENCES = {"constant velocity": "test_constant_velocity", "copy-last": "test_copy_last"}
 LINES = {"constant velocity": ":", "copy-last": (0, (4, 1, 1, 1))}
 SHORT = 30  # characters of a label that fits into half a column
 
 
 @dataclass(frozen=True, eq=False)
 class ForecastRecord:
-    """Everything that the figure shows. Errors are in squared scaled units."""
+    """Everything that the figure shows."""
 
     data: DataSet
+    error: str  # MSE or DISTANCE
     bands: tuple[Band, ...]  # one for each method, over predicted steps
     references: Mapping[str, Floats]  # (T,) by name, of those that are stored
     statistic: Statistic
@@ -49,7 +54,7 @@ class ForecastRecord:
     @property
     def stem(self) -> str:
         """The files' name without ending."""
-        return f"{NAME}_{self.data.file_name}"
+        return f"{NAME}_{self.data.file_name}" + f"_{self.error}" * (self.error != MSE)
 
     @property
     def steps(self) -> int:
@@ -75,30 +80,35 @@ class ForecastRecord:
 
 
 def collect(
-    store: Store, data: DataSet, selection: Selection, statistic: Statistic = Statistic.MEAN_CI
+    store: Store, data: DataSet, selection: Selection, statistic: Statistic = Statistic.MEAN_CI, error: str = MSE
 ) -> ForecastRecord:
     """Collect the test errors of the chosen runs on the data set.
 
-    Raises InputError for a run that has not ended, and for runs that were tested in different ways.
+    Raises InputError for an unknown error, a run that has not ended or did not store this error, and for runs that were
+    tested in different ways.
     """
+    if error not in (MSE, DISTANCE):
+        raise unknown_name("error", error, (MSE, DISTANCE))
     tested_alike(NAME, selection.runs)
+    metric = f"test/{error}"
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     rows = [
         (run.id, step, error)
         for run in finished
-        for step, error in enumerate(store.array(run.id, ERRORS).astype(np.float64), start=1)
+        for step, error in enumerate(store.array(run.id, metric).astype(np.float64), start=1)
     ]
     errors = pd.DataFrame(rows, columns=["run_id", "step", "value"])  # like Store.metrics
     record = ForecastRecord(
         data=data,
-        bands=tuple(band(group, ERRORS, errors, statistic) for group in selection.groups),
-        references=_references(store, finished),
+        error=error,
+        bands=tuple(band(group, metric, errors, statistic) for group in selection.groups),
+        references=_references(store, finished, error),
         statistic=statistic,
         provenance=Provenance.of(
             NAME,
             selection.runs,
             curves=selection.curves,
-            options={"statistic": statistic, "data": data.name},
+            options={"statistic": statistic, "error": error, "data": data.name},
         ),
         notes=selection.notes,
     )
@@ -106,9 +116,10 @@ def collect(
     return replace(record, notes=(*record.notes, *cut, *_last_errors(record)))
 
 
-def _references(store: Store, runs: list[RunRow]) -> dict[str, Floats]:
+def _references(store: Store, runs: Sequence[RunRow], error: str) -> dict[str, Floats]:
     found = {}
-    for name, array in REFERENCES.items():
+    for name, prefix in REFERENCES.items():
+        array = f"{prefix}/{error}"
         stored = [store.array(run.id, array).astype(np.float64) for run in runs if array in store.array_names(run.id)]
         if stored:
             found[name] = np.median(stored, axis=0)
@@ -135,7 +146,7 @@ def draw(record: ForecastRecord) -> Figure:
         handles = [curves.draw_band(axes, shown, strokes[shown.label]) for shown in record.bands]
         handles += [_draw_reference(axes, name, errors) for name, errors in record.references.items()]
         style.step_axis(axes, record.steps)
-        axes.set_ylabel(label(ERRORS))
+        axes.set_ylabel(label(f"test/{record.error}"))
         title = f"{style.literal(record.data.name)}; {curves.legend_title(record.statistic)}"
         figure.legend(handles=handles, loc="outside upper center", ncols=columns, title=title)
         return figure

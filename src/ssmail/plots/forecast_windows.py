@@ -109,6 +109,11 @@ class Window:
             )
 
 
+def are_stored(store: Store, run: RunRow) -> bool:
+    """Return whether the run stored forecasts of test windows."""
+    return not {"test/samples", "test/predictions"}.isdisjoint(store.array_names(run.id))
+
+
 def read(store: Store, run: RunRow, indices: Sequence[int] | None, most: int) -> tuple[tuple[Window, ...], int]:
     """Return the windows of the run with these indices, by default its first `most`, and how many it stored.
 
@@ -164,12 +169,12 @@ def notes(run: RunRow, windows: Sequence[Window], count: int) -> tuple[str, ...]
 
 def panel(figure: Figure, place: tuple[int, int, int], axes: int) -> Axes:
     """Return a panel for windows of so many position axes, at a place such as (rows, columns, 1)."""
-    projection = {"projection": "3d", "computed_zorder": False} if axes == 3 else {}
+    projection: dict[str, Any] = {"projection": "3d", "computed_zorder": False} if axes == 3 else {}
     made: Axes = figure.add_subplot(*place, **projection)
     return made
 
 
-def draw_window(axes: Axes, window: Window, until: int | None = None) -> None:
+def draw_window(axes: Any, window: Window, until: int | None = None) -> None:
     """Draw the window into a panel that fits it, up to the step `until`, with dots where agents are at the end."""
     count = max(len(window.samples), 1)
     looks = {
@@ -186,9 +191,8 @@ def draw_window(axes: Axes, window: Window, until: int | None = None) -> None:
         lines = _lines(window, kind)[:, shown]  # (R, T', 1 + P or P)
         _add_lines(axes, lines, gid=f"{kind}-{window.index}", **look)
         ends = lines[:, -1]
-        axes.scatter(
-            *ends.T, s=sizes[kind], color=look["color"], lw=0, zorder=look["zorder"], clip_on=axes.name != "3d"
-        )
+        dot = {"s": sizes[kind], "color": look["color"], "lw": 0, "zorder": look["zorder"]}
+        axes.scatter(*ends.T, clip_on=window.axes != 3, **dot)
 
 
 def _lines(window: Window, kind: str) -> Floats:
