@@ -69,6 +69,7 @@ class Window:
             return np.arange(self.first_step, 1)
         return np.arange(0 if len(self.observed) else 1, len(self.future) + 1)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def limits(self) -> tuple[Floats, Floats]:
         """Return the lowest and the highest position (P,) in the picture.
 
@@ -128,9 +129,8 @@ def read(store: Store, run: RunRow, indices: Sequence[int] | None, most: int) ->
         observed, agents = future[:, :0], None
     else:
         raise InputError(f"run {run.name} {_lack(run)}")
+    _check_shapes(observed, future, samples, agents)
     count = len(future)
-    if not 1 <= future.shape[-1] <= len(AXES) or observed.ndim != 4 or samples.ndim != 5:
-        raise ValueError(f"positions of shape {future.shape}")
     chosen = list(indices if indices else range(min(most, count)))
     for index in chosen:
         if not 0 <= index < count:
@@ -145,6 +145,16 @@ def read(store: Store, run: RunRow, indices: Sequence[int] | None, most: int) ->
         )
         for index in dict.fromkeys(chosen)
     ), count
+
+
+def _check_shapes(observed: Any, future: Any, samples: Any, agents: Any) -> None:
+    """Raise ValueError where arrays are not (W, H, N, P), (W, T, N, P), (S, W, T, N, P) and 1 to N agents (W,)."""
+    windows, _, most, axes = future.shape
+    fits = samples.shape[1:] == future.shape and observed.shape == (windows, observed.shape[1], most, axes)
+    if not fits or not 1 <= axes <= len(AXES):
+        raise ValueError(f"positions of shapes {observed.shape}, {future.shape} and {samples.shape}")
+    if agents is not None and (agents.shape != (windows,) or (agents < 1).any() or (agents > most).any()):
+        raise ValueError(f"numbers of agents other than 1 to {most}")
 
 
 def _lack(run: RunRow) -> str:
@@ -237,7 +247,7 @@ def frame(axes: Any, window: Window, ratio: float = 1.0) -> None:
         axes.set_aspect("equal")
         axes.grid(False)
     else:
-        axes.set_box_aspect((1, 1, 1), zoom=0.92)
+        axes.set_box_aspect((1, 1, 1), zoom=0.86)
         axes.tick_params(pad=-3, labelsize=5)
 
 
