@@ -21,6 +21,22 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pairing = Literal["start", "nearest", "assignment"]
 
 
+def _flag_or(*words: str) -> BeforeValidator:
+    """Return a validator of values that are true, false or one of the words."""
+
+    def check(value: Any) -> Any:
+        if not isinstance(value, bool) and value not in words:
+            raise ValueError(f"takes true, false or {' or '.join(words)}, not {str(value)[:20]!r}")
+        return value
+
+    return BeforeValidator(check)
+
+
+# What is "auto", and what the data decide where it is null, is resolved by ssmail.training.data_defaults.
+Automatic = Annotated[bool | Literal["auto"], _flag_or("auto")]
+Standardize = Annotated[bool | Literal["pooled", "auto"], _flag_or("pooled", "auto")]
+
+
 class Frozen(BaseModel):
     """An immutable model that rejects unknown keys and values of other types (3 is a float; "3" and True are not)."""
 
@@ -128,12 +144,16 @@ class ModelSpec(Frozen):
     time_input: bool  # every network reads the step index, scaled to [-1, 1]
     start_input: bool  # every network reads each agent's first state
     root_relative: bool  # positions are relative to those of the first agent, which are zero
-    agent_input: bool  # every network reads a one-hot agent index, for agents that differ, such as joints
+    centre_relative: Automatic  # positions are relative to the mean of the group's; auto: where groups wander
+    # every network reads a one-hot agent index, for agents that differ, such as joints; auto: if the agents of all
+    # trajectories are the same ones
+    agent_input: Automatic
     # networks read states and actions normalized by each agent's mean and standard deviation over the training set, and
-    # action_step and action_bound are in these units
-    standardize: bool
-    action_step: Positive  # largest change of velocity by an action; scaled units unless standardize
-    action_bound: Positive  # largest distance of the velocity from 0 (with standardize: from the mean)
+    # action_step and action_bound are in these units; pooled: one mean and standard deviation for all agents; auto:
+    # those of each agent if the agents of all trajectories are the same ones
+    standardize: Standardize
+    action_step: Positive | None  # largest change of velocity by an action; scaled units unless standardize
+    action_bound: Positive | None  # largest distance of the velocity from 0 (with standardize: from the mean)
     initial_scale: NonNegative  # of the actor's last weights: how far the untrained mean is from the current velocity
     log_std_min: Finite
     log_std_max: Finite
@@ -201,7 +221,7 @@ class SacSpec(Frozen):
     temperature: NonNegative  # fixed, or the initial one if automatic
     automatic_temperature: bool
     temperature_learning_rate: Positive
-    target_entropy: Finite  # nats per action dimension of one agent, for actions in scaled units
+    target_entropy: Finite | None  # nats per action dimension of one agent, for actions in scaled units
     # consecutive steps of a trajectory that the encoder's gradient covers in an update (truncated BPTT); null: all
     encoder_steps: Count | None
     # steps over which the actor's objective follows the policy through the known dynamics and rewards before the
@@ -216,9 +236,10 @@ class SacSpec(Frozen):
 class VariationalSpec(Frozen):
     """Network sizes and loss terms of nri and dnri (Kipf et al. 2018; Graber and Schwing 2020)."""
 
-    root_relative: bool  # these three as in ModelSpec
-    agent_input: bool
-    standardize: bool
+    root_relative: bool  # these four as in ModelSpec
+    centre_relative: Automatic
+    agent_input: Automatic
+    standardize: Standardize
     hidden: Count  # of the encoder's MLPs
     memory: Count  # of the LSTM of an edge, in each direction (dnri)
     head: Count  # hidden size of the heads that output edge types
@@ -230,7 +251,7 @@ class VariationalSpec(Frozen):
     # nri: steps that its encoder reads as one input, as published; null: any number, embedded one by one and averaged
     encoder_window: Count | None
     temperature: Positive  # temperature of the Gumbel-softmax relaxation
-    variance: Positive  # of the Gaussian likelihood, scaled units squared
+    variance: Positive | None  # of the Gaussian likelihood, scaled units squared
     kl_weight: NonNegative  # weight of the KL divergence of the posterior from the prior
     # nri: prior probability of the first edge type; the others share the rest
     none_prior: Annotated[float, Field(gt=0, lt=1)]
@@ -271,6 +292,9 @@ class EvaluationSpec(Frozen):
 
     train_rollouts: Count  # training trajectories whose starts are rolled out for an epoch's training metrics
     samples: Count  # rollouts per test start
+    # trajectories: validation windows that judge an epoch, evenly over the split (null: all), and forecasts of each
+    validation_windows: Count | None
+    validation_samples: Count | None
     # model selection prefers epochs whose validation lane_balance is at least this
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
     # reward landscapes to store, evenly over the epochs, in addition to those of the untrained and of the current model
@@ -279,10 +303,15 @@ class EvaluationSpec(Frozen):
 
 
 class ForecastSpec(Frozen):
-    """The test on recorded motion: frames observed and predicted, and the noise of section 4.6 on the model's input."""
+    """The test by forecasts: frames observed and predicted, distances that count, and the noise of section 4.6."""
 
-    observed: Count  # frames observed at test time; prediction starts from the last of them
-    predicted: Count  # frames predicted after them
+    # frames observed at test time, and predicted after the last of them; null: as many as the expert set was made for
+    observed: Count | None
+    predicted: Count | None
+    # distance at the last frame from which a forecast is a miss, raw units; null: a fifth of the mean distance that
+    # agents of the training split cover in the predicted frames
+    miss_distance: Positive | None
+    collision_distance: Positive | None  # two agents that are nearer collide, raw units; null: not measured
     noise: NonNegative  # standard deviation of the Gaussian noise in the noisy test, scaled units
     noise_on: Literal["all", "history"]  # noise on every state that the model reads, or on the observed ones only
     noise_seed: NonNegativeCount  # seed of the noise, which all methods and seeds of runs share

@@ -18,7 +18,7 @@ from ssmail.errors import InputError, shortened
 
 Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
 METHODS: tuple[str, ...] = get_args(Method)
-Environment = Literal["yjunction", "letters", "mocap"]
+Environment = Literal["yjunction", "letters", "mocap", "trajectories"]
 ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 
 _ADVERSARIAL = ("model", "adversarial", "sac", "curriculum", "training")
@@ -34,7 +34,12 @@ METHOD_SECTIONS: dict[str, tuple[str, ...]] = {
     "constant-velocity": (),
     "copy-last": (),
 }
-ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {"yjunction": (), "letters": (), "mocap": ("forecast",)}
+ENVIRONMENT_SECTIONS: dict[str, tuple[str, ...]] = {
+    "yjunction": (),
+    "letters": (),
+    "mocap": ("forecast",),
+    "trajectories": ("forecast",),
+}
 OPTIONAL_SECTIONS = tuple(dict.fromkeys(chain(*METHOD_SECTIONS.values(), *ENVIRONMENT_SECTIONS.values())))
 GENERATED_ENVIRONMENTS = ("yjunction", "letters")  # environments with a data generator, configured by data.ENVIRONMENT
 
@@ -53,6 +58,9 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("sac", "average", None),
     ("variational", "encoder_window", None),
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
+    *((section, "centre_relative", False) for section in ("model", "variational")),
+    *(("forecast", key, None) for key in ("miss_distance", "collision_distance")),
+    *(("evaluation", key, None) for key in ("validation_windows", "validation_samples")),
 )
 _ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
 

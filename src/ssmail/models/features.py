@@ -44,25 +44,46 @@ class Features:
 
     steps: the trajectory length; the step index 0 .. steps - 1 is scaled to -1 .. 1.
     root_relative: take positions relative to agent 0, the root of a skeleton, whose own positions become zeros.
+    centre_relative: take positions relative to the mean position of the group at the same step.
     agents: the length N of the one-hot of the agent; 0 leaves it out.
-    normalization: per-agent normalization of states and actions; None leaves them in scaled units.
+    normalization: normalization of states and actions; None leaves them in scaled units.
     """
 
     time: bool
     start: bool
     steps: int
     root_relative: bool = False
+    centre_relative: bool = False
     agents: int = 0
     normalization: Normalization | None = None
 
     @classmethod
-    def of(cls, spec: ModelSpec | VariationalSpec, experts: Tensor) -> "Features":
-        """Return the features that a spec asks for, fitted to the training states `experts` (M, T, N, D), scaled."""
-        steps, agents = experts.shape[1:3]
-        plain = cls(False, False, steps, spec.root_relative, agents * spec.agent_input)
+    def of(cls, spec: ModelSpec | VariationalSpec, *experts: Tensor) -> "Features":
+        """Return the features that a spec without "auto" asks for, fitted to scaled training states.
+
+        experts: (M, T, N, D) for each number N of agents in the expert set.
+        """
+        steps, agents = experts[0].shape[1:3]
+        plain = cls(
+            time=False,
+            start=False,
+            steps=steps,
+            root_relative=spec.root_relative,
+            centre_relative=spec.centre_relative is True,
+            agents=agents * (spec.agent_input is True),
+        )
         if isinstance(spec, ModelSpec):
             plain = replace(plain, time=spec.time_input, start=spec.start_input)
-        return replace(plain, normalization=Normalization.fit(plain._relative(experts))) if spec.standardize else plain
+        if not spec.standardize:
+            return plain
+        relative = [plain._relative(states) for states in experts]
+        fit = Normalization.pooled if spec.standardize == "pooled" else Normalization.fit
+        return replace(plain, normalization=fit(*relative))
+
+    @property
+    def is_relative(self) -> bool:
+        """Whether what is read of an agent's position depends on the positions of others."""
+        return self.root_relative or self.centre_relative
 
     def size(self, state_size: int) -> int:
         """Return the number of features F of an agent with `state_size` state features."""
@@ -96,8 +117,9 @@ class Features:
         return relative if self.normalization is None else self.normalization.normalize(relative)
 
     def _relative(self, states: Tensor) -> Tensor:
-        """Take the positions of states (..., N, 2P) relative to the root, if asked for."""
-        if not self.root_relative:
+        """Take the positions of states (..., N, 2P) relative to the root or the group's centre, if asked for."""
+        if not self.is_relative:
             return states
         position, velocity = states.chunk(2, dim=-1)
-        return torch.cat([position - position[..., :1, :], velocity], dim=-1)
+        origin = position.mean(dim=-2, keepdim=True) if self.centre_relative else position[..., :1, :]
+        return torch.cat([position - origin, velocity], dim=-1)

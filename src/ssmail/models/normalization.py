@@ -1,4 +1,4 @@
-"""Per-agent normalization of features, and the bounds on actions that follow from it."""
+"""Normalization of features by mean and standard deviation, and the bounds on actions that follow from it."""
 
 from dataclasses import dataclass
 
@@ -13,9 +13,10 @@ CLIP = 5.0  # standard deviations from the mean
 
 @dataclass(frozen=True)
 class Normalization:
-    """Per-agent mean and standard deviation of the state features over the training set.
+    """Mean and standard deviation of the state features over the training set, of each agent or of all.
 
-    mean, std: (N, D), of the features as networks read them: scaled, and relative to the root where the spec says so.
+    mean, std: (N or 1, D), of the features as networks read them: scaled, and relative to the root or to the group's
+    centre where the spec says so.
     """
 
     mean: Tensor
@@ -29,9 +30,14 @@ class Normalization:
         std = torch.where(floored > 0, floored, torch.ones_like(floored))
         return cls(mean.to(states.dtype), std.to(states.dtype))
 
+    @classmethod
+    def pooled(cls, *states: Tensor) -> "Normalization":
+        """Fit one mean and standard deviation for all agents, from states (M, T, N, D) for each number of agents N."""
+        return cls.fit(torch.cat([part.flatten(0, 2) for part in states]).unsqueeze(1).unsqueeze(1))
+
     @property
     def velocity(self) -> "Normalization":
-        """The normalization of the velocities alone, (N, A) each."""
+        """The normalization of the velocities alone, (N or 1, A) each."""
         return Normalization(self.mean.chunk(2, dim=-1)[1], self.std.chunk(2, dim=-1)[1])
 
     def normalize(self, states: Tensor) -> Tensor:
@@ -48,7 +54,7 @@ class Normalization:
 @dataclass(frozen=True)
 class ActionBounds:
     """The velocities that an action can choose, in scaled units: at most `step` from the current velocity, and between
-    `low` and `high`. Each is (N, A), or a scalar for all agents.
+    `low` and `high`. Each is (N or 1, A), or a scalar for all agents.
     """
 
     step: Tensor
@@ -58,8 +64,10 @@ class ActionBounds:
     @classmethod
     def of(cls, spec: ModelSpec, normalization: Normalization | None = None) -> "ActionBounds":
         """Return the bounds of a spec, which are in scaled units or, with a normalization, in standard deviations
-        around each agent's mean velocity.
+        around the mean velocity.
         """
+        assert spec.action_step is not None  # resolved by then
+        assert spec.action_bound is not None
         if normalization is None:
             bound = torch.tensor(spec.action_bound)
             return cls(torch.tensor(spec.action_step), -bound, bound)

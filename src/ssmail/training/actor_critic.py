@@ -229,6 +229,7 @@ class SoftActorCritic:
         if learns:
             self.optimizers["actor"].step(loss - self.spec.graph_entropy * at.edge_entropy)
         if learns and self.spec.automatic_temperature:
+            assert self.spec.target_entropy is not None  # resolved by then
             target_entropy = self.spec.target_entropy * at.actions.shape[-1]
             learned = self.log_temperature.view(-1, 1, 1, 1)
             self.optimizers["temperature"].step(temperature_loss(learned, log_prob, target_entropy))

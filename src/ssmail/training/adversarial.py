@@ -29,7 +29,8 @@ from ssmail.models.critic import TwinCritic
 from ssmail.models.discriminator import Discriminator
 from ssmail.models.features import Waves
 from ssmail.training.actor_critic import ActorCritic, SoftActorCritic, at_steps
-from ssmail.training.batches import Batch, ReplayBuffer
+from ssmail.training.agent_numbers import replay_buffers, replay_name
+from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext
@@ -59,7 +60,7 @@ OBJECTIVES = {
 
 
 class AdversarialLearner:
-    """The networks, optimizers and replay buffer of one seed."""
+    """The networks, optimizers and replay buffers of one seed."""
 
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
@@ -72,7 +73,7 @@ class AdversarialLearner:
             self.label = checked_label(spec.self_supervision, load_label(spec.self_supervision.label))
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.generators.seeds["weights"])
-            self.predictor = PolicyPredictor.create(model, context.experts, context.integrator)
+            self.predictor = PolicyPredictor.create(model, context.by_number, context.integrator)
             self.features = self.predictor.features
             inputs = self.features.size(context.experts.states.shape[-1]) + context.experts.actions.shape[-1]
             critic = TwinCritic(inputs, model).to(context.device)
@@ -93,7 +94,7 @@ class AdversarialLearner:
             {**self.actor_critic.optimizers, "discriminator": self.optimizer},
             {**self.actor_critic.final_rates, "discriminator": self.adversarial.learning_rate_final},
         )
-        self.replay = ReplayBuffer(self.adversarial.replay, context.experts)
+        self.replays = replay_buffers(self.adversarial.replay, context.by_number)
 
     def networks(self) -> list[nn.Module]:
         """Return policy, critics and discriminator."""
@@ -121,12 +122,12 @@ class AdversarialLearner:
         return scaled_reward(self.adversarial, self.objective.reward(score))
 
     def parts(self) -> Mapping[str, Stateful]:
-        """Return all networks, optimizers and the replay buffer."""
+        """Return all networks, optimizers and the replay buffers."""
         return {
             "actor_critic": self.actor_critic,
             "discriminator": self.discriminator,
             "optimizer": self.optimizer,
-            "replay": self.replay,
+            **self.replays,
         }
 
 
@@ -151,7 +152,7 @@ class AdversarialTraining:
         self.adversarial, self.training = first.adversarial, first.training
         self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
-        self.experts, self.device = context.experts, context.device
+        self.experts, self.device = context.experts, context.device  # the experts of this update's number of agents
         self.input_noise = self.adversarial.input_noise  # of this epoch
         self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
         self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
@@ -171,28 +172,37 @@ class AdversarialTraining:
         frequency = intervention_frequency(self.curriculum, epoch, self.training.epochs)
         for seed in self.seeds:
             seed.schedule.set(epoch)
-        # tau_G from the current policy, into the replay buffer.
-        latest, interventions = self.generate(frequency)
-        for seed, made in zip(self.seeds, latest.of_each(), strict=True):
-            seed.replay.add(made)
-        replay = Batch.of_seeds([seed.replay.trajectories for seed in self.seeds])
+        # tau_G from the current policy, into the replay buffers.
+        turns = self.context.turns(epoch, self.training.updates)
+        latest, replay, interventions = {}, {}, []
+        for turn in sorted(set(turns)):
+            self.experts = self.context.by_number[turn]
+            share = turns.count(turn) / len(turns)
+            latest[turn], made = self.generate(frequency, max(1, round(share * self.adversarial.rollouts)))
+            replay[turn] = self._remember(latest[turn])
+            interventions.append(made)
         final = self.adversarial.input_noise_final ** (epoch / max(self.training.epochs - 1, 1))
         self.input_noise = self.adversarial.input_noise * final
         # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
         actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
-        logs = [self.update(latest, replay, actor_learns=actor_learns) for _ in range(self.training.updates)]
+        logs = []
+        for turn in turns:
+            self.experts = self.context.by_number[turn]
+            logs.append(self.update(latest[turn], replay[turn], actor_learns=actor_learns))
         means = {name: torch.stack([log[name] for log in logs]).double().mean(dim=0).tolist() for name in logs[0]}
         return [
-            {name: values[s] for name, values in means.items()} | curriculum_metrics(frequency, [interventions[s]])
+            {name: values[s] for name, values in means.items()}
+            | curriculum_metrics(frequency, [made[s] for made in interventions])
             for s in range(len(self.seeds))
         ]
 
-    def generate(self, frequency: float) -> tuple[Batch, Tensor]:
+    def generate(self, frequency: float, count: int | None = None) -> tuple[Batch, Tensor]:
         """Generate tau_G from random training starts, and return it with the interventions (S, B, T).
 
-        `frequency` is the curriculum's probability of an intervention per step (trajectory forcing, section 3.3).
+        frequency: the curriculum's probability of an intervention per step (trajectory forcing, section 3.3). count: of
+        trajectories for each seed, adversarial.rollouts by default.
         """
-        count, steps = self.adversarial.rollouts, self.context.steps
+        count, steps = count or self.adversarial.rollouts, self.context.steps
         starts = self.experts.draw(count, self.generators["data"])
         interventions = drawn(self.generators["curriculum"], lambda g: draw_interventions(count, steps, frequency, g))
         made = self.predictor.rollout(
@@ -203,6 +213,13 @@ class AdversarialTraining:
             interventions=interventions.to(self.device) if frequency > 0 else None,
         )
         return Batch(made.states, made.actions, starts.source), interventions
+
+    def _remember(self, latest: Batch) -> Batch:
+        """Add tau_G to the replay buffers of its number of agents, and return all that they hold."""
+        name = replay_name(latest.states.shape[-2], self.context.by_number)
+        for seed, made in zip(self.seeds, latest.of_each(), strict=True):
+            seed.replays[name].add(made)
+        return Batch.of_seeds([seed.replays[name].trajectories for seed in self.seeds])
 
     def update(self, latest: Batch, replay: Batch, *, actor_learns: bool = True) -> dict[str, Tensor]:
         """Take adversarial.updates discriminator steps, then one SAC step (two time scales).

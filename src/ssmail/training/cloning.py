@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import required
+from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.learner import LearnerContext
 from ssmail.training.optimization import LearningRateSchedule, add_noise, clipped_step, mean_metrics
@@ -49,17 +50,18 @@ class CloningLearner(SupervisedLearner):
     def __init__(self, context: LearnerContext) -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(context.generators.seeds["weights"])
-            self.predictor = PolicyPredictor.create(required(context.spec.model), context.experts, context.integrator)
+            self.predictor = PolicyPredictor.create(required(context.spec.model), context.by_number, context.integrator)
         self.policy = self.predictor.model
         super().__init__(context, "policy", self.policy)
 
     def run_epoch(self, epoch: int) -> dict[str, float]:
         """Take training.updates gradient steps."""
         self.schedule.set(epoch)
-        return mean_metrics([self._update() for _ in range(self.training.updates)])
+        turns = self.context.turns(epoch, self.training.updates)
+        return mean_metrics([self._update(self.context.by_number[turn]) for turn in turns])
 
-    def _update(self) -> dict[str, float]:
-        batch = self.context.experts.draw(self.training.batch, self.generators["data"])
+    def _update(self, experts: Batch) -> dict[str, float]:
+        batch = experts.draw(self.training.batch, self.generators["data"])
         read = add_noise(batch.states[:, :-1], self.cloning.input_noise, self.generators["data"])
         b, t, n, _ = read.shape
         x = self.predictor.features(read, batch.states[:, 0])

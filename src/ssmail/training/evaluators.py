@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssmail.config.sections import required
+from ssmail.config.sections import ForecastSpec, required
 from ssmail.data.letters import first_letter_step
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories
 from ssmail.errors import InputError
@@ -23,6 +23,7 @@ from ssmail.evaluation.metrics import (
 )
 from ssmail.training.baselines import Baseline, ConstantVelocity, CopyLast
 from ssmail.training.batches import Arrays, Batch, to_numpy
+from ssmail.training.data_defaults import forecast_frames
 from ssmail.training.learner import LearnerContext, Predictor
 
 
@@ -222,7 +223,7 @@ class ForecastEvaluator(Evaluator):
     def __init__(self, context: LearnerContext, data: ExpertSet) -> None:
         super().__init__(context, data)
         self.forecast = required(context.spec.forecast)
-        self._check_windows()
+        self.observed, self.predicted = check_frames(self.forecast, data)
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """Predict each validation window from its first frame, and some training windows, once."""
@@ -262,15 +263,6 @@ class ForecastEvaluator(Evaluator):
         arrays["test/expert"] = self._kept_positions(truth)
         return values, arrays
 
-    def _check_windows(self) -> None:
-        observed, predicted = self.forecast.observed, self.forecast.predicted
-        frames = self.data.test.positions.shape[1]
-        if observed + predicted > frames:
-            raise InputError(
-                f"forecast.observed {observed} and forecast.predicted {predicted} need {observed + predicted} frames, "
-                f"but the test windows of the data have {frames}; lower one of the two with --set."
-            )
-
     def _kept_positions(self, states: Floats) -> np.ndarray:
         """Return raw positions of the first KEPT_WINDOWS windows of scaled states (B, T, N, D)."""
         scaled = states[: self.KEPT_WINDOWS, ..., : states.shape[-1] // 2]
@@ -279,34 +271,38 @@ class ForecastEvaluator(Evaluator):
 
     def _predict(self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: bool) -> tuple[Floats, Floats]:
         """Return predictions (S, B, T', N, D) of the frames after the observed ones, and the truth (B, T', N, D)."""
-        h, steps, b = self.forecast.observed, self.forecast.predicted, len(states)
+        h, steps, b = self.observed, self.predicted, len(states)
         samples = 1 if isinstance(predictor, Baseline) and not noisy else self.spec.samples
         observed = states[:, :h].repeat(samples, 1, 1, 1)
-        noise = self._input_noise(observed, steps) if noisy else None
+        noise = input_noise(self.forecast, observed, steps) if noisy else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
         made = to_numpy(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
         return made, to_numpy(states[:, h : h + steps])
 
-    def _input_noise(self, observed: Tensor, steps: int) -> Tensor:
-        """Draw the noise on every state that a predictor reads: the same for all methods and seeds."""
-        generator = torch.Generator().manual_seed(self.forecast.noise_seed)
-        b, h, n, d = observed.shape
-        noise = self.forecast.noise * torch.randn(b, h + steps - 1, n, d, generator=generator)
-        if self.forecast.noise_on == "history":
-            noise[:, h:] = 0
-        return noise.to(self.device)
+
+def check_frames(forecast: ForecastSpec, data: ExpertSet) -> tuple[int, int]:
+    """Return how many frames are observed and predicted. Raises InputError if the test windows are too short."""
+    observed, predicted = forecast_frames(forecast, data)
+    frames = data.test.positions.shape[1]
+    if observed + predicted > frames:
+        raise InputError(
+            f"forecast.observed {observed} and forecast.predicted {predicted} need {observed + predicted} frames, "
+            f"but the test windows of the data have {frames}; lower one of the two with --set."
+        )
+    return observed, predicted
 
 
-EVALUATORS: dict[str, type[Evaluator]] = {
-    "yjunction": LaneEvaluator,
-    "letters": LetterEvaluator,
-    "mocap": ForecastEvaluator,
-}
+def input_noise(forecast: ForecastSpec, observed: Tensor, steps: int) -> Tensor:
+    """Draw the noise on every state that a predictor reads: the same for all methods and seeds.
 
-
-def make_evaluator(context: LearnerContext, data: ExpertSet) -> Evaluator:
-    """Make the evaluator of the spec's environment."""
-    return EVALUATORS[context.spec.environment](context, data)
+    observed: (B, H, N, D). The noise is (B, H + steps - 1, N, D).
+    """
+    generator = torch.Generator().manual_seed(forecast.noise_seed)
+    b, h, n, d = observed.shape
+    noise = forecast.noise * torch.randn(b, h + steps - 1, n, d, generator=generator)
+    if forecast.noise_on == "history":
+        noise[:, h:] = 0
+    return noise.to(observed.device)
 
 
 def _prefixed(prefix: str, values: Mapping[str, float]) -> dict[str, float]:

@@ -74,8 +74,8 @@ def position_gradient(
     moved[..., agent, :2] = position
     read = learner.features.normalize_states(moved)
     own = torch.cat([read[..., agent, :], at.other_features[..., agent, :].expand(*position.shape[:-1], -1)], dim=-1)
-    # What the others are read as does not depend on the position, unless it is that of the root.
-    others = read if learner.features.root_relative else learner.features.normalize_states(at.states)
+    # What the others are read as does not depend on the position, unless positions are relative.
+    others = read if learner.features.is_relative else learner.features.normalize_states(at.states)
     x = torch.cat([others, at.other_features.expand(*others.shape[:-1], -1)], dim=-1)
     values = learner.agent_reward(agent, own, x, at.actions.expand(*others.shape[:-1], -1))
     (gradient,) = torch.autograd.grad(values.sum(), position)

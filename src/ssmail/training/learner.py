@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ssmail.config.spec import RunSpec
 from ssmail.envs.integrator import Integrator
+from ssmail.training.agent_numbers import turns
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.seeding import Generators
@@ -16,12 +17,27 @@ from ssmail.training.seeding import Generators
 
 @dataclass(frozen=True)
 class LearnerContext:
-    """Everything that a learner is built from. `experts` holds the training split, scaled, on the learner's device."""
+    """Everything that a learner is built from.
+
+    spec: without null or "auto" for what the data decide. experts: the training split, scaled, on the learner's device.
+    others: of a set in which the number of agents differs, the trajectories with other numbers than the most common
+    one, which `experts` has; a batch for each number.
+    """
 
     spec: RunSpec
     experts: Batch
     integrator: Integrator
     generators: Generators
+    others: tuple[Batch, ...] = ()
+
+    @property
+    def by_number(self) -> tuple[Batch, ...]:
+        """The training split, for each number of agents."""
+        return (self.experts, *self.others)
+
+    def turns(self, epoch: int, updates: int) -> list[int]:
+        """Return the index in `by_number` of the trajectories that each update of an epoch trains on."""
+        return turns([len(batch) for batch in self.by_number], epoch * updates, updates)
 
     @property
     def device(self) -> torch.device:

@@ -18,14 +18,17 @@ from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import SsmailError
 from ssmail.training.adversarial import AdversarialLearner
+from ssmail.training.agent_numbers import batches_by_number
 from ssmail.training.baselines import BaselineLearner, ConstantVelocity, CopyLast
-from ssmail.training.batches import Arrays, Batch
+from ssmail.training.batches import Arrays
 from ssmail.training.checkpoint import UnfitState, entries, fitted, fitted_number, load_part
 from ssmail.training.cloning import CloningLearner
-from ssmail.training.evaluators import make_evaluator
+from ssmail.training.data_defaults import resolve
+from ssmail.training.evaluators import Evaluator, ForecastEvaluator, LaneEvaluator, LetterEvaluator
 from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
 from ssmail.training.learner import Learner, LearnerContext
 from ssmail.training.seeding import Generators
+from ssmail.training.trajectory_evaluator import TrajectoryEvaluator
 from ssmail.training.variational import VariationalLearner
 
 LEARNERS: dict[str, Callable[[LearnerContext], Learner]] = {
@@ -39,6 +42,14 @@ LEARNERS: dict[str, Callable[[LearnerContext], Learner]] = {
     "copy-last": lambda context: BaselineLearner(CopyLast()),
 }
 """The table of methods."""
+
+EVALUATORS: dict[str, type[Evaluator]] = {
+    "yjunction": LaneEvaluator,
+    "letters": LetterEvaluator,
+    "mocap": ForecastEvaluator,
+    "trajectories": TrajectoryEvaluator,
+}
+"""The table of environments."""
 
 
 class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fault
@@ -65,11 +76,12 @@ class TrainingLoop:
         self.dataset_hash = self.data.hash
         self.scaling = self.data.scaling
         self.generators = Generators(seed)
-        self.experts = Batch.from_trajectories(self.data.train, self.scaling, self.device)
+        self.experts, *others = batches_by_number(self.data.train, self.scaling, self.device)
         self.integrator = Integrator(self.scaling)
-        context = LearnerContext(spec, self.experts, self.integrator, self.generators)
+        resolved = resolve(spec, self.data, [self.experts, *others])
+        context = LearnerContext(resolved, self.experts, self.integrator, self.generators, tuple(others))
         self.learner = LEARNERS[spec.method](context)
-        self.evaluator = make_evaluator(context, self.data)
+        self.evaluator = EVALUATORS[spec.environment](context, self.data)
         self.epoch = 0
         self.improved = False
         self.best = self._as_best(True, math.inf)

@@ -1,5 +1,6 @@
 """Rollouts of a graph policy in the trajectory environment."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Unpack
 
@@ -43,9 +44,13 @@ class PolicyPredictor:
     integrator: Integrator
 
     @classmethod
-    def create(cls, spec: ModelSpec, experts: Batch, integrator: Integrator) -> "PolicyPredictor":
-        """Make a policy with initial weights from torch's global generator, sized and normalized for `experts`."""
-        features = Features.of(spec, experts.states)
+    def create(cls, spec: ModelSpec, by_number: Sequence[Batch], integrator: Integrator) -> "PolicyPredictor":
+        """Make a policy with initial weights from torch's global generator, sized and normalized for the experts.
+
+        by_number: the training split, for each number of agents.
+        """
+        experts = by_number[0]
+        features = Features.of(spec, *(batch.states for batch in by_number))
         bounds = ActionBounds.of(spec, features.normalization)
         size, action_size = features.size(experts.states.shape[-1]), experts.actions.shape[-1]
         policy = GraphPolicy(size, action_size, spec, bounds).to(experts.states.device)

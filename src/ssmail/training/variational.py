@@ -20,6 +20,7 @@ from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
+from ssmail.training.batches import Batch
 from ssmail.training.cloning import SupervisedLearner
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
 from ssmail.training.learner import LearnerContext, Reading
@@ -194,7 +195,9 @@ class VariationalLearner(SupervisedLearner):
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
         self.variational, self.curriculum = required(spec.variational), required(spec.curriculum)
-        features = Features.of(self.variational, context.experts.states)
+        assert self.variational.variance is not None  # resolved by then
+        self.variance = self.variational.variance
+        features = Features.of(self.variational, *(batch.states for batch in context.by_number))
         state_size = context.experts.states.shape[-1]
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(context.generators.seeds["weights"])
@@ -202,7 +205,7 @@ class VariationalLearner(SupervisedLearner):
         self.model = model.to(context.device)
         self.predictor = VariationalPredictor(self.model, context.integrator)
         super().__init__(context, "model", self.model)
-        vectors = self.training.batch * context.experts.states.shape[2]
+        vectors = self.training.batch * min(batch.states.shape[2] for batch in context.by_number)
         if isinstance(model.encoder, WindowEncoder) and self.variational.batch_norm and vectors == 1:
             remedy = "set training.batch=2 or variational.batch_norm=false"
             raise InputError(f"batch norm needs two agents in a batch, and there is one; {remedy}.")
@@ -214,11 +217,14 @@ class VariationalLearner(SupervisedLearner):
         batch, steps, updates = self.training.batch, self.context.steps, self.training.updates
         curriculum = self.generators["curriculum"]
         interventions = [draw_interventions(batch, steps, frequency, curriculum) for _ in range(updates)]
-        logs = [self._update(mask) for mask in interventions]
+        turns = self.context.turns(epoch, updates)
+        logs = [
+            self._update(self.context.by_number[turn], mask) for turn, mask in zip(turns, interventions, strict=True)
+        ]
         return mean_metrics(logs) | curriculum_metrics(frequency, interventions)
 
-    def _update(self, interventions: Tensor) -> dict[str, float]:
-        batch = self.context.experts.draw(self.training.batch, self.generators["data"])
+    def _update(self, experts: Batch, interventions: Tensor) -> dict[str, float]:
+        batch = experts.draw(self.training.batch, self.generators["data"])
         states = batch.states[:, :-1]
         # Encode: posterior and prior over graphs, and one sample from the posterior. nri as published reads the whole
         # window; the other encoders leave out the last state, after which nothing is predicted.
@@ -234,7 +240,7 @@ class VariationalLearner(SupervisedLearner):
             batch.states[:, 1:],
             posterior,
             prior,
-            variance=self.variational.variance,
+            variance=self.variance,
             kl_weight=self.variational.kl_weight,
         )
         self.step(loss)
