@@ -1,7 +1,7 @@
 """Flocks as own trajectories: windows of scenes in which 3 to 12 boids fly to one of two goals (tests/data/flock.py).
 
-    python -m tests.data.flocks flocks.npz --numbers 3 12             # the set, with --seed 0
-    ssmail train --env trajectories --set data.path=flocks.npz --seeds 0-2
+python -m tests.data.flocks flocks.npz --numbers 3 12             # the set, with --seed 0
+ssmail train --env trajectories --set data.path=flocks.npz --seeds 0-2
 """
 
 import argparse

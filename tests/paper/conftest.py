@@ -103,16 +103,10 @@ def add_trajectories(add_run: AddRun) -> AddRun:
         **shape: Any,
     ) -> str:
         found = {**forecasts(level, **shape), **windows(axes), **(extra or {})}
-        spec = own_spec(method, path, overrides)
+        spec = build_spec(method, "trajectories", "smoke", [f"data.path={path}", *overrides])
         return add_run(seed, [1.0], state, spec=spec, dataset_hash=dataset_hash, final=final, **found)
 
     return add
-
-
-def own_spec(method: str, path: str, overrides: Sequence[str] = ()) -> RunSpec:
-    """The spec of a run on the user's own trajectories."""
-    spec = build_spec(method, "mocap", "smoke", [f"data.path={path}", *overrides])
-    return spec.model_copy(update={"environment": "trajectories"})
 
 
 @pytest.fixture
