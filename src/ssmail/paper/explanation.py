@@ -9,7 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from ssmail.config.foreign_files import open_regular, read_whole
-from ssmail.errors import InputError
+from ssmail.errors import InputError, stored_values
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
 from ssmail.plots import forecast_curves, forecast_trajectories, provenance, training_curves
@@ -141,20 +141,28 @@ def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
             raise InputError("it does not tell which metrics of which groups it shows")
         runs = store.runs(ids=source.run_ids)
         return training_curves.collect(store, runs, [*map(str, metrics)], group_by, statistic).table()
-    if name == forecast_curves.NAME:
-        (data,) = data_sets(store, store.runs(ids=source.run_ids))
-        selection, error = data.selection(named=True), str(options.get("error"))
-        return forecast_curves.collect(store, data, selection, statistic, error).table()
-    if name == forecast_trajectories.NAME:
-        windows = options.get("windows")
-        if len(source.run_ids) != 1 or not isinstance(windows, list) or not all(type(one) is int for one in windows):
-            raise InputError("it does not tell which windows of which run it shows")
-        return forecast_trajectories.collect(store, source.run_ids[0], windows).table()
+    if name in (forecast_curves.NAME, forecast_trajectories.NAME):
+        with stored_values("its runs"):
+            return _collect_forecasts(source, store, statistic)
     if name not in FIGURES:
         raise InputError(f"this ssmail draws no figure {name}")
     module = FIGURES[name]
     environment = source.runs[0].environment if module.has_environment and source.runs else None
     return module.collect(store, source.run_ids, statistic=statistic, environment=environment).table()
+
+
+def _collect_forecasts(source: Provenance, store: Store, statistic: Statistic) -> pd.DataFrame:
+    options = source.options
+    if source.figure == forecast_curves.NAME:
+        sets = data_sets(store, store.runs(ids=source.run_ids))
+        if len(sets) != 1:
+            raise InputError("its runs are not on one data set")
+        selection, error = sets[0].selection(named=True), str(options.get("error"))
+        return forecast_curves.collect(store, sets[0], selection, statistic, error).table()
+    windows = options.get("windows")
+    if len(source.run_ids) != 1 or not isinstance(windows, list) or not all(type(index) is int for index in windows):
+        raise InputError("it does not tell which windows of which run it shows")
+    return forecast_trajectories.collect(store, source.run_ids[0], windows).table()
 
 
 def _first_difference(explanation: Explanation, text: str) -> str:

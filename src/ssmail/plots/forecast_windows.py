@@ -251,6 +251,7 @@ def frame(axes: Any, window: Window, ratio: float = 1.0) -> None:
         axes.tick_params(pad=-3, labelsize=5)
 
 
+@np.errstate(invalid="ignore")
 def ratio(windows: Sequence[Window]) -> float:
     """Return the height of panels in the plane over their width, which fits most windows."""
     extents = np.array([high - low for low, high in (window.limits() for window in windows)])
