@@ -73,7 +73,7 @@ def draw(record: TrajectoriesRecord) -> Figure:
     with style.sheet():
         figure = style.new_figure(height=0.75 + rows * tall)
         for place, window in enumerate(windows):
-            panel = forecast_windows.panel(figure, (rows, columns, place + 1), axes)
+            panel = forecast_windows.panel(figure, (rows, columns, place + 1), axes, record.run.environment)
             forecast_windows.frame(panel, window, ratio)
             forecast_windows.draw_window(panel, window)
             panel.set_title(f"window {window.index} ({counted(window.future.shape[1], 'agent')})", fontsize=7, pad=2)

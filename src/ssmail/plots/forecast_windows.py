@@ -26,11 +26,13 @@ from ssmail.plots.formatting import counted, spans
 from ssmail.store import RunRow, Store
 
 AXES = ("x", "y", "z")
+UPWARDS = {"mocap": "y"}  # by environment, the axis that points up
 UNITS = {"mocap": "ASF units"}  # by environment; those of other data are not known
 OBSERVED, TRUE, SAMPLED = style.REFERENCE, "#D55E00", "#0072B2"
 MOST_SAMPLES = 50  # of a window
 BEYOND = 0.5  # of a window's extent: how far from the truth its picture may reach
 MARGIN = 0.06
+CROWD = 8  # agents; lines of more are thinner
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,32 +179,36 @@ def notes(run: RunRow, windows: Sequence[Window], count: int) -> tuple[str, ...]
     return about, *outside
 
 
-def panel(figure: Figure, place: tuple[int, int, int], axes: int) -> Axes:
+def panel(figure: Figure, place: tuple[int, int, int], axes: int, environment: str) -> Axes:
     """Return a panel for windows of so many position axes, at a place such as (rows, columns, 1)."""
-    projection: dict[str, Any] = {"projection": "3d", "computed_zorder": False} if axes == 3 else {}
-    made: Axes = figure.add_subplot(*place, **projection)
-    return made
+    if axes < 3:
+        return figure.add_subplot(*place)
+    made: Any = figure.add_subplot(*place, projection="3d", computed_zorder=False)
+    made.view_init(vertical_axis=UPWARDS.get(environment, "z"))
+    plane: Axes = made
+    return plane
 
 
 def draw_window(axes: Any, window: Window, until: int | None = None) -> None:
     """Draw the window into a panel that fits it, up to the step `until`, with dots where agents are at the end."""
     count = max(len(window.samples), 1)
-    looks = {
+    looks: dict[str, dict[str, Any]] = {
         "sampled": {"color": SAMPLED, "lw": 0.6, "alpha": float(np.clip(4 / count, 0.2, 0.8)), "zorder": 2},
         "true": {"color": TRUE, "lw": 1.2, "zorder": 3},
         "observed": {"color": OBSERVED, "lw": 1.2, "zorder": 4},
     }
     sizes = {"sampled": 2.0, "true": 7.0, "observed": 7.0}
+    thin = float(np.clip(CROWD / window.future.shape[1], 0.4, 1.0))
     for kind, look in looks.items():
         steps = window.steps(kind)
         shown = steps <= (steps.max(initial=1) if until is None else until)
         if not shown.any() or (kind != "observed" and until is not None and until < 1):
             continue
         lines = _lines(window, kind)[:, shown]  # (R, T', 1 + P or P)
-        _add_lines(axes, lines, gid=f"{kind}-{window.index}", **look)
+        _add_lines(axes, lines, gid=f"{kind}-{window.index}", **{**look, "lw": thin * look["lw"]})
         ends = lines[:, -1]
-        dot = {"s": sizes[kind], "color": look["color"], "lw": 0, "zorder": look["zorder"]}
-        axes.scatter(*ends.T, clip_on=window.axes != 3, **dot)
+        dot = {"s": thin**2 * sizes[kind], "color": look["color"], "lw": 0, "zorder": look["zorder"]}
+        axes.scatter(*ends.T, **dot, **({"depthshade": False} if window.axes == 3 else {}))
 
 
 def _lines(window: Window, kind: str) -> Floats:
