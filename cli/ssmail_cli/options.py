@@ -41,7 +41,7 @@ def _known_formats(formats: list[str]) -> list[str]:
     return formats
 
 
-def _known_statistic(stat: str | None) -> str | None:
+def known_statistic(stat: str | None) -> str | None:
     """Return the name as given. Raises InputError for an unknown statistic."""
     from ssmail.evaluation.statistics import Statistic
 
@@ -107,14 +107,14 @@ Formats = Annotated[
 ]
 Stat = Annotated[
     str | None,
-    typer.Option("--stat", callback=_known_statistic, help=f"Centre and band: {STATISTICS}.", show_default="mean-std"),
+    typer.Option("--stat", callback=known_statistic, help=f"Centre and band: {STATISTICS}.", show_default="mean-std"),
 ]
 _WITH_STATISTIC = list(dict.fromkeys(figure.name for figure in FIGURES.values() if figure.has_statistic))
 StatOfFigures = Annotated[
     str | None,
     typer.Option(
         "--stat",
-        callback=_known_statistic,
+        callback=known_statistic,
         help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
         show_default="mean-std",
     ),

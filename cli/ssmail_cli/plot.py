@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperCommand
 
 from ssmail.errors import ExitCode, InputError, stored_values, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail_cli import options
+from ssmail_cli.figure_group import ALL, FigureGroup
 from ssmail_cli.options import open_store, parse_statistic
 from ssmail_cli.output import note, say
 from ssmail_cli.report import draw_all
@@ -22,79 +23,7 @@ if TYPE_CHECKING:
     from ssmail.plots import FigureRecord
     from ssmail.store import RunRow, Store
 
-ALL = "all"
 EPILOG = "--out, --format and --db may be given too; see `ssmail plot --help`."
-
-
-class FigureGroup(TyperGroup):
-    """A group whose command line may name several things to draw, with options before, between and after the names.
-
-    `plot fig4 --out X fig5 --profile quick` is read as `plot --out X` followed by the lines `fig4 --profile quick` and
-    `fig5 --profile quick`: the group has the options in common, and every command parses all the others, so click
-    refuses one that the command does not have. Only an option in SHARED may be meant for some of the commands alone.
-    """
-
-    SHARED = frozenset({"--runs", "--profile", "--stat"})
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Split the line, and let click parse the options in common and, for a single command, its line."""
-        names, given = self._split(args, ctx.resilient_parsing)
-        common = {option for parameter in self.params for option in parameter.opts}
-        own = {key: tokens for key, tokens in given.items() if key not in common}
-        lines = ctx.meta["lines"] = [[name, *self._options_of(name, names, own)] for name in names]
-        first = lines[0] if lines else [token for tokens in own.values() for token in tokens]
-        return super().parse_args(ctx, [*(token for key in given if key in common for token in given[key]), *first])
-
-    def invoke(self, ctx: Any) -> None:
-        """Parse the line of every command, then run the commands."""
-        lines = ctx.meta["lines"]
-        if not lines:
-            super().invoke(ctx)  # fails with "Missing command."
-        for name, *_ in lines:
-            if name not in self.commands:
-                raise unknown_name("figure", name, [*FIGURES, *self.commands])
-        if len(lines) > 1 and any(name == ALL for name, *_ in lines):
-            raise InputError(f"{ALL} is every figure of the paper already; give it alone.")
-        super(TyperGroup, self).invoke(ctx)  # the callback of the group
-        contexts = [self.commands[name].make_context(name, line, parent=ctx) for name, *line in lines]
-        for context in contexts:
-            with context:
-                context.command.invoke(context)
-
-    def _split(self, args: Sequence[str], completing: bool) -> tuple[list[str], dict[str, list[str]]]:
-        """Return the names, without aliases and repetitions, and the tokens of each option by its key, as --out.
-
-        Raises InputError for an option without its value, except when the shell is completing the line.
-        """
-        parameters = [*self.params, *(parameter for command in self.commands.values() for parameter in command.params)]
-        is_flag = {key: getattr(parameter, "is_flag", False) for parameter in parameters for key in parameter.opts}
-        is_flag |= {"-h": True, "--help": True}
-        names: dict[str, None] = {}
-        given: dict[str, list[str]] = {}
-        tokens = iter(args)
-        for token in tokens:
-            if not token.startswith("-"):
-                names[FIGURES[token].name if token in FIGURES else token] = None
-                continue
-            option = given.setdefault(token.partition("=")[0], [])
-            option.append(token)
-            if "=" not in token and not is_flag.get(token):
-                value = next(tokens, None)
-                if value is not None:
-                    option.append(value)
-                elif token in is_flag and not completing:
-                    raise InputError(f"option '{token}' requires an argument.")
-        return list(names), given
-
-    def _options_of(self, name: str, names: Sequence[str], given: dict[str, list[str]]) -> list[str]:
-        """Return the tokens for one of the commands: all but SHARED options that only others of them have."""
-        options = {
-            other: {key for parameter in self.commands[other].params for key in parameter.opts}
-            for other in names
-            if other in self.commands
-        }
-        for_others = self.SHARED & set().union(*options.values()) - options.get(name, set())
-        return [token for key, tokens in given.items() if key not in for_others for token in tokens]
 
 
 @dataclass(frozen=True)
@@ -124,7 +53,7 @@ def plot(
     formats: options.Formats = options.DEFAULT_FORMATS,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Draw figures of the paper, training curves, reward landscapes and recorded walking.
+    """Draw figures of the paper, training curves, forecasts, reward landscapes and recorded walking.
 
     Give one name or several, as in `ssmail plot fig4 fig5 --format pdf`; `ssmail plot NAME --help` shows the options of
     each. A figure of the paper also goes by the name in parentheses. Each drawing comes with a CSV of exactly what it
@@ -148,6 +77,16 @@ FigureRuns = Annotated[
         show_default="those of experiments.yaml, else the spec with the most seeds",
     ),
 ]
+OnlyRuns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--runs",
+        metavar="RUN[,RUN...]",
+        callback=_split_ids,
+        help="Only these runs (ids or their first digits); repeatable.",
+    ),
+]
+Methods = Annotated[list[str] | None, typer.Option("--method", help="Only runs of this method; repeatable.")]
 OneRun = Annotated[
     str, typer.Option("--run", metavar="RUN", help="Id of the run or its first digits; see `ssmail runs list`.")
 ]
@@ -198,9 +137,10 @@ for _module in dict.fromkeys(FIGURES.values()):
 
 @app.command(ALL, epilog=EPILOG)
 def every_figure(ctx: typer.Context, profile: options.Profile = None, stat: options.Stat = None) -> None:
-    """Every figure of the paper whose runs are stored.
+    """Every figure of the paper whose runs are stored, and forecast and trajectories of each data set.
 
-    For each of the others, prints on stderr the command that computes its runs; the exit code is then 3.
+    For each of the others, prints on stderr the command that computes its runs; the exit code is then 3. Where all runs
+    are on data of your own, the figures of the paper are left out.
     """
     to = ctx.obj
     if any(drawn.lacks for drawn in draw_all(open_store(to.db), to.out, to.formats, profile, parse_statistic(stat))):
@@ -218,18 +158,10 @@ def training(
             show_default="; ".join(f"{shown.curve} of {name}" for name, shown in ENVIRONMENT_METRICS.items()),
         ),
     ] = None,
-    methods: Annotated[list[str] | None, typer.Option("--method", help="Only runs of this method; repeatable.")] = None,
+    methods: Methods = None,
     environment: options.Environment = None,
     profile: options.Profile = None,
-    runs: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--runs",
-            metavar="RUN[,RUN...]",
-            callback=_split_ids,
-            help="Only these runs (ids or their first digits); repeatable.",
-        ),
-    ] = None,
+    runs: OnlyRuns = None,
     group_by: Annotated[
         str, typer.Option("--group-by", help="method, seed, or a key of the spec such as curriculum.beta.")
     ] = "method",
@@ -240,14 +172,14 @@ def training(
     from ssmail.plots import training_curves
 
     statistic, store = parse_statistic(stat) or Statistic.MEAN_STD, open_store(ctx.obj.db)
-    chosen = _training_runs(store, methods, ids=runs, environment=environment, profile=profile)
+    chosen = _chosen_runs(store, methods, ids=runs, environment=environment, profile=profile)
     metrics = metrics or list(dict.fromkeys(environment_metrics(run.environment).curve for run in chosen))
     with stored_values("these runs"):
         record = training_curves.collect(store, chosen, metrics, group_by, statistic)
         ctx.obj.save("training", record.stem, record, training_curves.draw(record))
 
 
-def _training_runs(store: "Store", methods: Sequence[str] | None, **conditions: Any) -> "list[RunRow]":
+def _chosen_runs(store: "Store", methods: Sequence[str] | None, **conditions: Any) -> "list[RunRow]":
     """Return the runs that meet every condition, newest last. Raises InputError for an unknown method or no run."""
     from ssmail.config.experiments_file import load_experiments
 
@@ -259,6 +191,69 @@ def _training_runs(store: "Store", methods: Sequence[str] | None, **conditions: 
     if not runs:
         raise InputError(f"no run in {store.where} meets these conditions; `ssmail runs list` shows those there are.")
     return runs
+
+
+@app.command(epilog=EPILOG)
+def forecast(
+    ctx: typer.Context,
+    methods: Methods = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    runs: OnlyRuns = None,
+    error: Annotated[
+        str, typer.Option("--error", help="mse (scaled units) or distance (units of the data, where stored).")
+    ] = "mse",
+    stat: Annotated[
+        str | None,
+        typer.Option(
+            "--stat",
+            callback=options.known_statistic,
+            help=f"Centre and band: {options.STATISTICS}.",
+            show_default="mean-ci",
+        ),
+    ] = None,
+) -> None:
+    """The error of forecasts over the predicted steps, of any methods: a figure for each data set.
+
+    Draws runs on recorded motion and on trajectories of your own. Of each method it takes the spec with the most seeds;
+    with --runs, all of these runs, each spec by itself. Constant velocity and copies of the last state are drawn beside
+    them.
+    """
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.plots import data_sets, forecast_curves
+
+    statistic, store = parse_statistic(stat) or Statistic.MEAN_CI, open_store(ctx.obj.db)
+    chosen = _chosen_runs(store, methods, ids=runs, environment=environment, profile=profile)
+    for data in data_sets.required(store, "forecast", chosen):
+        with stored_values(f"the runs on {data.name}"):
+            selection = data.selection(named=bool(runs))
+            record = forecast_curves.collect(store, data, selection, statistic, error)
+            ctx.obj.save("forecast", record.stem, record, forecast_curves.draw(record))
+
+
+@app.command(epilog=EPILOG)
+def trajectories(
+    ctx: typer.Context,
+    run: OneRun,
+    windows: Annotated[
+        list[int] | None,
+        typer.Option(
+            "--window",
+            min=0,
+            help="Number of a test window among those that the run stored; repeatable.",
+            show_default="the first four",
+        ),
+    ] = None,
+) -> None:
+    """Forecasts of a run: test windows as observed, their true future, and sampled futures.
+
+    In one, two or three dimensions, for runs on recorded motion and on trajectories of your own.
+    """
+    from ssmail.plots import forecast_trajectories
+
+    with stored_values(f"run {run}"):
+        record = forecast_trajectories.collect(open_store(ctx.obj.db), run, windows)
+        ctx.obj.save("trajectories", record.stem, record, forecast_trajectories.draw(record))
 
 
 @app.command(epilog=EPILOG)
@@ -278,12 +273,28 @@ def landscape(
 
 
 @app.command(epilog=EPILOG)
-def film(ctx: typer.Context, run: OneRun) -> None:
-    """The learned reward of a run on a plane, over training (GIF)."""
-    from ssmail.plots import landscape_film
+def film(
+    ctx: typer.Context,
+    run: OneRun,
+    window: Annotated[
+        int | None,
+        typer.Option("--window", min=0, help="Number of the test window, of a forecast.", show_default="the first"),
+    ] = None,
+) -> None:
+    """The learned reward of a run on a plane, over training; or a forecast of a run, over its steps (GIF)."""
+    from ssmail.plots import data_sets, forecast_film, landscape_film
 
+    store = open_store(ctx.obj.db)
+    (found,) = store.runs(ids=[run])
     with stored_values(f"run {run}"):
-        record = landscape_film.collect(open_store(ctx.obj.db), run, landscape_film.FILM)
+        if found.environment in data_sets.ENVIRONMENTS:
+            forecast = forecast_film.collect(store, run, window)
+            _print_notes("film", forecast)
+            say(forecast_film.save_film(forecast, ctx.obj.out))
+            return
+        if window is not None:
+            raise InputError(f"run {found.name} is on {found.environment}, whose film shows no window; leave it out.")
+        record = landscape_film.collect(store, run, landscape_film.FILM)
         _print_notes("film", record)
         say(landscape_film.save_film(record, ctx.obj.out))
 

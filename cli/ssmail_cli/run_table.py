@@ -63,6 +63,23 @@ ENVIRONMENT_METRICS = {
             "test/diverged": "diverged",
         },
     ),
+    "trajectories": EnvironmentMetrics(
+        error="test/fde",
+        validation="validation/energy",
+        curve="validation/energy",
+        compared={
+            "test/ade": "ade",
+            "test/fde": "fde",
+            "test/min_fde_5": None,
+            "test/min_fde_20": "min_fde\n_20",
+            "test/miss_rate_20": None,
+            "test/coverage": "coverage",
+            "test/mse_last": "mse at\nthe end",
+            "test_constant_velocity/fde": "const.\nvelocity",
+            "test_constant_velocity/mse_last": None,
+            "test/diverged": None,
+        },
+    ),
 }
 
 

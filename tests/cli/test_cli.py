@@ -46,6 +46,8 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         *(f"plot fig{number}" for number in range(1, 10)),
         "plot all",
         "plot training",
+        "plot forecast",
+        "plot trajectories",
         "plot landscape",
         "plot film",
         "plot skeleton",

@@ -63,7 +63,7 @@ def test_the_film_of_a_run(cli: CommandLine, run: str, where: tuple[object, ...]
         ("film --run {run} --runs {run}", "`ssmail plot film` has no option --runs; did you mean --run?"),
         ("film --run {run} --profile smoke", "`ssmail plot film` has no option --profile;"),
         ("film --run {run} --stat mean-ci", "`ssmail plot film` has no option --stat;"),
-        ("all fig4", "all is every figure of the paper already; give it alone."),
+        ("all fig4", "all is every figure already; give it alone."),
         ("all --runs {run}", "`ssmail plot all` has no option --runs;"),
         ("all --metric a", "`ssmail plot all` has no option --metric;"),
         ("landscpe", "unknown figure 'landscpe'; did you mean landscape"),

@@ -6,9 +6,11 @@ import pytest
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import ENVIRONMENTS
+from ssmail.data import expert_sets
 from ssmail.training.loop import TrainingLoop
 from ssmail_cli.progress import LABELS
 from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics, key_metrics
+from tests.data import flocks
 from tests.data.mocap.handmade import write_set
 
 
@@ -18,6 +20,9 @@ def test_what_is_shown_is_recorded(environment: str, tmp_path: Path) -> None:
     if environment == "mocap":
         windows = write_set(tmp_path / "mocap.npz", frames=(101, 51, 101), window=50, test_window=100)
         overrides = [f"data.path={windows}", "forecast.predicted=40"]
+    if environment == "trajectories":
+        expert_sets.save(flocks.generate([2, 3], scenes=8), tmp_path / "flock.npz")
+        overrides = [f"data.path={tmp_path / 'flock.npz'}", "evaluation.samples=20"]
     loop = TrainingLoop(build_spec("constant-velocity", environment, "smoke", overrides), 0)
     shown = ENVIRONMENT_METRICS[environment]
     assert {shown.validation, shown.curve} <= loop.evaluator.epoch(loop.learner.predictor).keys()

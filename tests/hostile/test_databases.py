@@ -45,6 +45,8 @@ COMMANDS = (
     ("plot", "--out", "figures", "--format", "svg", "fig5"),
     ("plot", "--out", "figures", "--format", "svg", "fig9"),
     ("plot", "--out", "figures", "--format", "svg", "training"),
+    ("plot", "--out", "figures", "--format", "svg", "forecast"),
+    ("plot", "--out", "figures", "--format", "svg", "trajectories", "--run", RUN),
     ("report", "--out", "figures", "--format", "svg"),
     ("train", "--method", "ssail", "--profile", "smoke", "--seeds", "0-1", "--dry-run"),
 )

@@ -73,10 +73,27 @@ HOSTILE = st.one_of(
     st.floats(),
     st.text(),
     st.sampled_from(
-        ["../../x", "/etc/passwd", "\x1b[31m", "$\\frac{", "fig1", "fig8", "film", "train/mode_mse", "*", "%"]
+        [
+            "../../x",
+            "/etc/passwd",
+            "\x1b[31m",
+            "$\\frac{",
+            "fig1",
+            "fig8",
+            "film",
+            "forecast",
+            "trajectories",
+            "train/mode_mse",
+            "*",
+            "%",
+        ]
     ),
     st.lists(st.text(max_size=5), max_size=3),
-    st.dictionaries(st.sampled_from(["store", "runs", "statistic", "metrics", "group_by", "x"]), st.text(), max_size=3),
+    st.dictionaries(
+        st.sampled_from(["store", "runs", "statistic", "metrics", "group_by", "windows", "error", "x"]),
+        st.text(),
+        max_size=3,
+    ),
 )
 
 

@@ -10,7 +10,7 @@ from ssmail.config.experiments import ablation_specs, build_spec, figure_require
 from ssmail.config.spec import RunSpec
 from ssmail.store import RunState, Store
 
-from .handmade_arrays import arrays, forecasts
+from .handmade_arrays import arrays, forecasts, windows
 from .handmade_landscapes import landscapes, linear, vector_field
 
 AddRun = Callable[..., str]
@@ -78,6 +78,33 @@ def add_forecast(add_run: AddRun) -> AddRun:
         spec = build_spec(method, "mocap", "smoke", overrides)
         found = {**forecasts(level, **shape), **(errors or {})}
         return add_run(seed, [1.0], state, spec=spec, **found)
+
+    return add
+
+
+@pytest.fixture
+def add_trajectories(add_run: AddRun) -> AddRun:
+    """add_trajectories(seed, level, method="ssail", state, path, overrides, axes, slope, steps) -> id of a run on the
+    user's own trajectories, in profile smoke; a finished one has handmade_arrays.forecasts and windows.
+    """
+
+    def add(
+        seed: int = 0,
+        level: float = 0.001,
+        method: str = "ssail",
+        state: RunState = RunState.FINISHED,
+        *,
+        path: str = "flock.npz",
+        overrides: Sequence[str] = (),
+        axes: int = 2,
+        dataset_hash: str = "e" * 64,
+        final: Mapping[str, float] | None = None,
+        extra: Mapping[str, np.ndarray] | None = None,
+        **shape: Any,
+    ) -> str:
+        found = {**forecasts(level, **shape), **windows(axes), **(extra or {})}
+        spec = build_spec(method, "trajectories", "smoke", [f"data.path={path}", *overrides])
+        return add_run(seed, [1.0], state, spec=spec, dataset_hash=dataset_hash, final=final, **found)
 
     return add
 

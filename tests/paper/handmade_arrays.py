@@ -3,6 +3,7 @@
 import numpy as np
 
 STARTS, SAMPLES, STEPS, AGENTS = 3, 2, 5, 2
+OBSERVED = 4
 
 
 def lanes() -> np.ndarray:
@@ -14,7 +15,8 @@ def lanes() -> np.ndarray:
 
 def forecasts(level: float, slope: float = 0.5, steps: int = STEPS) -> dict[str, np.ndarray]:
     """What a finished mocap run stores of its error per predicted step: level * (1 + slope * step) and, with noise,
-    three times as much. Of constant velocity it is 0.001 * step, and with noise 0.002 * step.
+    three times as much. Of constant velocity it is 0.001 * step, and with noise 0.002 * step; of copies of the last
+    state 0.004 * step.
     """
     step = np.arange(1.0, steps + 1)
     clean = level * (1 + slope * step)
@@ -23,7 +25,26 @@ def forecasts(level: float, slope: float = 0.5, steps: int = STEPS) -> dict[str,
         "test_noisy/mse": 3 * clean,
         "test_constant_velocity/mse": 0.001 * step,
         "test_constant_velocity_noisy/mse": 0.002 * step,
+        "test_copy_last/mse": 0.004 * step,
     }
+
+
+def windows(axes: int = 2) -> dict[str, np.ndarray]:
+    """What a finished run on the user's own trajectories stores of three test windows with 3, 2 and 1 agents, of which
+    OBSERVED steps are observed and STEPS predicted. Agent n of window w is at t + n + 10 w at step t, and on the other
+    axes at n; step 0 is the last observed one. Sample s is 0.1 (s + 1) t beside it on the last axis.
+    """
+    step = np.arange(1.0 - OBSERVED, STEPS + 1)
+    agent, window = np.arange(3.0), np.arange(3.0)
+    positions = np.broadcast_to(agent[:, None], (3, len(step), 3, axes)).copy()
+    positions[..., 0] += step[:, None] + 10 * window[:, None, None]
+    agents = np.array([3, 2, 1])
+    positions *= (agent < agents[:, None])[:, None, :, None]
+    observed, future = positions[:, :OBSERVED], positions[:, OBSERVED:]
+    samples = np.repeat(future[None], SAMPLES, axis=0)
+    samples[..., -1] += 0.1 * (np.arange(SAMPLES) + 1)[:, None, None, None] * step[OBSERVED:, None]
+    found = {"test/observed": observed, "test/future": future, "test/samples": samples}
+    return {name: values.astype(np.float32) for name, values in found.items()} | {"test/agents": agents}
 
 
 def arrays(shift: float = 0.0) -> dict[str, np.ndarray]:

@@ -12,7 +12,8 @@ from ssmail.paper import fig5_modes
 from ssmail.paper.reads import USUAL_CURVES, contents
 from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail.paper.samples import Runs
-from ssmail.plots import NoRuns
+from ssmail.plots import NoRuns, forecast_curves, forecast_trajectories
+from ssmail.plots.data_sets import data_sets
 from ssmail.plots.run_groups import Reads
 from ssmail.store import RunState, Store
 from ssmail.store.maintenance.compact import Wanted, export_compact, settled_cells
@@ -90,6 +91,21 @@ def test_only_what_is_read_is_wanted_and_of_rollouts_the_part_that_is_shown(fill
     assert set(drawn) <= set(shown)
     small = exported(filled, tmp_path / "small.db")
     assert {small.array(run, "test/rollouts").shape for run in drawn} == {(1, 16, 5, 2, 2), (1, 3, 5, 2, 2)}
+    small.close()
+
+
+def test_forecasts_of_own_data_are_drawn_from_an_export_too(
+    store: Store, add_trajectories: Any, add_forecast: Any, tmp_path: Path
+) -> None:
+    run, recorded = add_trajectories(0), add_forecast(0, errors={"test/expert": np.zeros((1, 5, 1, 3))})
+    small = exported(store, tmp_path / "small.db")
+    kept = {name.partition("/")[0] for name in small.array_names(run)}
+    assert kept == {"test", "test_constant_velocity", "test_copy_last"}
+    assert "test/expert" not in small.array_names(recorded)  # no figure of the paper shows it
+    (whole,), (left,) = (data_sets(each, each.runs(ids=[run])) for each in (store, small))
+    for collect in (forecast_curves.collect, lambda each, *_: forecast_trajectories.collect(each, run)):
+        tables = [collect(each, data, data.selection()).table() for each, data in ((store, whole), (small, left))]
+        pd.testing.assert_frame_equal(*tables)
     small.close()
 
 

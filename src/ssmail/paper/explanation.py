@@ -9,15 +9,17 @@ from pathlib import Path
 import pandas as pd
 
 from ssmail.config.foreign_files import open_regular, read_whole
-from ssmail.errors import InputError
+from ssmail.errors import InputError, stored_values
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
-from ssmail.plots import provenance, training_curves
+from ssmail.plots import forecast_curves, forecast_trajectories, provenance, training_curves
+from ssmail.plots.data_sets import data_sets
 from ssmail.plots.provenance import LARGEST, Provenance, RunSource
 from ssmail.plots.saving import csv_text, digest
 from ssmail.store import RunRow, Store
 
-ENDINGS = (".png", ".pdf", ".svg", ".gif")
+FILM = ".gif"
+ENDINGS = (".png", ".pdf", ".svg", FILM)
 
 
 @dataclass(frozen=True)
@@ -82,6 +84,8 @@ def compare(explanation: Explanation, store: Store) -> Agreement:
         return Agreement(store.where, runs, None, "it is drawn from an expert set, not from runs")
     if missing:
         return Agreement(store.where, runs, None, f"{missing} of its {len(runs)} runs are missing")
+    if explanation.path.suffix.lower() == FILM:
+        return Agreement(store.where, runs, None, "a film keeps no hash of what it shows")
     if source.csv_sha256 is None:
         return Agreement(store.where, runs, None, "an older ssmail drew it, which kept no hash of what it shows")
     try:
@@ -137,11 +141,28 @@ def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
             raise InputError("it does not tell which metrics of which groups it shows")
         runs = store.runs(ids=source.run_ids)
         return training_curves.collect(store, runs, [*map(str, metrics)], group_by, statistic).table()
+    if name in (forecast_curves.NAME, forecast_trajectories.NAME):
+        with stored_values("its runs"):
+            return _collect_forecasts(source, store, statistic)
     if name not in FIGURES:
         raise InputError(f"this ssmail draws no figure {name}")
     module = FIGURES[name]
     environment = source.runs[0].environment if module.has_environment and source.runs else None
     return module.collect(store, source.run_ids, statistic=statistic, environment=environment).table()
+
+
+def _collect_forecasts(source: Provenance, store: Store, statistic: Statistic) -> pd.DataFrame:
+    options = source.options
+    if source.figure == forecast_curves.NAME:
+        sets = data_sets(store, store.runs(ids=source.run_ids))
+        if len(sets) != 1:
+            raise InputError("its runs are not on one data set")
+        selection, error = sets[0].selection(named=True), str(options.get("error"))
+        return forecast_curves.collect(store, sets[0], selection, statistic, error).table()
+    windows = options.get("windows")
+    if len(source.run_ids) != 1 or not isinstance(windows, list) or not all(type(index) is int for index in windows):
+        raise InputError("it does not tell which windows of which run it shows")
+    return forecast_trajectories.collect(store, source.run_ids[0], windows).table()
 
 
 def _first_difference(explanation: Explanation, text: str) -> str:

@@ -24,19 +24,17 @@ paper does not say over what its standard deviation is taken; here it is taken o
 its own.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from ssmail.data.trajectories import Floats
-from ssmail.errors import InputError
 from ssmail.evaluation.statistics import CONFIDENCE, Statistic, Summary, mean_interval
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed, smaller
@@ -44,8 +42,8 @@ from ssmail.paper.samples import WORST, Runs
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import REFERENCE, Band, band
 from ssmail.plots.provenance import Provenance
-from ssmail.plots.run_groups import Reads, Selection, check_settled
-from ssmail.store import RunRow, RunState, Store
+from ssmail.plots.run_groups import Reads, Selection, tested_alike
+from ssmail.store import RunState, Store
 
 NAME = "fig7"
 CONDITIONS = {"clean": "", "noisy": "_noisy"}  # input -> suffix of the split in the names of arrays
@@ -160,7 +158,7 @@ def collect(store: Store, selection: Selection, statistic: Statistic) -> NoiseRe
 
     Raises InputError for a run without test errors, and for runs that were tested in different ways.
     """
-    forecast = _forecast(selection.runs)
+    forecast = tested_alike(NAME, selection.runs)
     panels = tuple(_panel(store, selection, condition, statistic) for condition in CONDITIONS)
     what = "every state that is read" if forecast["noise_on"] == "all" else "the observed history alone"
     noise = f"noise: std {forecast['noise']:g} (scaled units) on {what}, the same draws for all runs."
@@ -171,21 +169,6 @@ def collect(store: Store, selection: Selection, statistic: Statistic) -> NoiseRe
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves, options={"statistic": statistic}),
         notes=(*selection.notes, noise, *(text for panel in panels for text in _panel_notes(panel))),
     )
-
-
-def _forecast(runs: Sequence[RunRow]) -> dict[str, Any]:
-    """The section `forecast` of the specs, which states how runs are tested. Raises InputError where runs differ."""
-    check_settled(runs, "test errors")
-    first = runs[0]
-    for run in runs:
-        differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"].get(key)]
-        if differs:
-            raise InputError(
-                f"runs {first.name} and {run.name} differ in forecast.{differs[0]}, so {NAME} cannot compare their "
-                "errors; leave one of them out."
-            )
-    found: dict[str, Any] = first.spec["forecast"]
-    return found
 
 
 def _panel(store: Store, selection: Selection, condition: str, statistic: Statistic) -> Panel:
@@ -277,7 +260,7 @@ def draw(record: NoiseRecord) -> Figure:
             handles = _draw_panel(axes, panel, strokes)
             title = "clean input" if panel.condition == "clean" else f"noisy input (std {record.noise:g} scaled units)"
             axes.set_title(title, loc="left", fontsize=7, weight="bold", pad=7)
-        _step_axis(grid[-1], record)
+        style.step_axis(grid[-1], max(panel.steps for panel in record.panels))
         figure.supylabel("test error, mse (10$^{-3}$ squared scaled units)", fontsize=8)
         title = curves.legend_title(record.statistic)
         figure.legend(handles=handles, loc="outside upper center", ncols=2, title=title)
@@ -296,10 +279,3 @@ def _draw_panel(axes: Axes, panel: Panel, strokes: dict[str, style.Stroke]) -> l
         line.set_label("constant velocity")
         handles.append(line)
     return handles
-
-
-def _step_axis(axes: Axes, record: NoiseRecord) -> None:
-    """Put ticks at the first and the last step and at the quarters between them."""
-    steps = max(panel.steps for panel in record.panels)
-    axes.set_xlabel("predicted step")
-    axes.xaxis.set_major_locator(FixedLocator(sorted({1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))})))

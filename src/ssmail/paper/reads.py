@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from ssmail.errors import InputError
 from ssmail.paper.results import FIGURES, FigureModule
+from ssmail.plots.data_sets import data_sets, is_own
 from ssmail.plots.series import select
 from ssmail.store import RunRow, Store
 from ssmail.store.maintenance.compact import Thinning, Wanted
@@ -14,6 +15,10 @@ USUAL_CURVES = tuple(
     f"{split}/{error}" for split in ("train", "validation") for error in ("mode_mse", "mse", "stroke_distance")
 )
 """The errors of every epoch: kept for all runs, whether or not a figure reads them."""
+
+
+FORECASTS = ("test", "test_constant_velocity", "test_copy_last")
+"""Of runs on data of the user's own, the first parts of the names of arrays that their figures show."""
 
 
 @dataclass(frozen=True)
@@ -33,6 +38,10 @@ def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
     curves = set(USUAL_CURVES)
     arrays: dict[str, dict[str, Thinning | None]] = {}
     undrawable: dict[str, str] = {}
+    for data in data_sets(only, [run for run in runs if is_own(run)]):
+        for run in data.runs:
+            names = store.array_names(run.id)
+            arrays[run.id] = dict.fromkeys(name for name in names if name.partition("/")[0] in FORECASTS)
     for figure in dict.fromkeys(FIGURES.values()):
         curves |= set(figure.reads.curves)
         for run_id in _drawn(only, figure, runs, undrawable):

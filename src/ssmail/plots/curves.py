@@ -28,6 +28,7 @@ from ssmail.store import RunRow, RunState, Store
 
 CEILING = DIVERGED**2  # squared scaled units: where a scale of errors ends
 REFERENCE = "test_constant_velocity"  # what driving straight on costs: prefix of the stored test errors
+SPAN = 30.0  # a larger factor between positive values calls for a logarithmic scale
 COLUMNS = ("kind", "label", "run_id", "seed", "epoch", "value", "low", "high")
 
 
@@ -222,6 +223,11 @@ def legend_title(statistic: Statistic) -> str:
 def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = CEILING) -> tuple[float, float]:
     """Return logarithmic limits for all values of the runs and of `others`; see style.log_limits."""
     return style.log_limits(np.concatenate([*(shown.finite for shown in bands), np.array(others)]), ceiling)
+
+
+def calls_for_logarithm(values: Floats) -> bool:
+    """Return whether these finite values, of any number, are positive and span more than a factor of SPAN."""
+    return bool(len(values) and values.min() > 0 and values.max() > SPAN * values.min())
 
 
 def linear_limits(bands: Sequence[Band]) -> tuple[float, float]:

@@ -9,8 +9,12 @@ UNITS = {
     "lag": "scaled units",
     "ade": "raw units of length",
     "fde": "raw units of length",
-    "min_ade_20": "step lengths",
-    "min_fde_20": "step lengths",
+    "distance": "raw units of length",
+    "energy": "scaled units",
+    "miss_rate": "share of windows",
+    "miss_rate_agent": "share of agents",
+    "collisions": "share of agents",
+    "coverage": "share of ends",
     "on_lane": "share of agents",
     "on_path": "share of agents",
     "path_rms": "step lengths",
@@ -25,7 +29,7 @@ UNITS = {
     "intervention_frequency": "per step",
     "best_epoch": "epochs",
 }
-ERRORS = frozenset({"mse", "mode_mse", "one_step_mse", "ade", "fde", "min_ade_20", "min_fde_20"})
+ERRORS = frozenset({"mse", "mode_mse", "one_step_mse", "ade", "fde", "distance", "energy"})
 
 
 def label(metric: str) -> str:
@@ -45,5 +49,9 @@ def last_part(metric: str) -> str:
 
 
 def _quantity(metric: str) -> str:
-    """Return the last part without the predicted step of a forecast: "test/mse_40" -> "mse"."""
-    return re.sub(r"^mse_\d+$", "mse", last_part(metric))
+    """Return the last part without a predicted step or a number of samples: "test/mse_40" -> "mse", and the best of
+    several samples as what it is the best of: "test/min_ade_20_agent" -> "ade".
+    """
+    name = re.sub(r"^mse_(\d+|last)$", "mse", last_part(metric))
+    name = re.sub(r"^min_([af]de)_\d+(_agent)?$", r"\1", name)
+    return re.sub(r"^miss_rate_\d+", "miss_rate", name)

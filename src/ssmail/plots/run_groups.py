@@ -3,11 +3,13 @@
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from datetime import datetime
+from typing import Any, NamedTuple
 
 from ssmail.config.experiments import to_tuples
 from ssmail.config.spec import flatten
 from ssmail.errors import InputError
+from ssmail.plots.formatting import counted
 from ssmail.store import RunRow
 from ssmail.store.maintenance.compact import Thinning
 
@@ -46,6 +48,23 @@ class Selection:
         return {run.id: group.label for group in self.groups for run in group.runs}
 
 
+class Family(NamedTuple):
+    """Settled runs of one spec, or of specs that differ in the ablation's key alone."""
+
+    runs: tuple[RunRow, ...]  # newest last
+    current: bool  # whether experiments.yaml gives these specs now
+
+    @property
+    def seeds(self) -> int:
+        """How many different cells (a spec and a seed) there are."""
+        return len({(run.spec_hash, run.seed) for run in self.runs})
+
+    @property
+    def rank(self) -> tuple[bool, int, datetime]:
+        """The greater, the better for drawing."""
+        return self.current, self.seeds, self.runs[-1].started
+
+
 @dataclass(frozen=True)
 class Reads:
     """What a figure and its claim read from a run, besides the last values of metrics.
@@ -82,9 +101,67 @@ def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:
         raise InputError(f"{figure} would mix runs on different data ({names}); name runs on one of them with --runs.")
 
 
+def tested_alike(figure: str, runs: Sequence[RunRow]) -> Mapping[str, Any]:
+    """Return the section `forecast` of the runs' specs, which states how they are tested.
+
+    Raises InputError for a run that has not ended, and where runs differ in it.
+    """
+    check_settled(runs, "test errors")
+    first = runs[0]
+    for run in runs:
+        differs = [key for key, value in run.spec["forecast"].items() if value != first.spec["forecast"].get(key)]
+        if differs:
+            raise InputError(
+                f"runs {first.name} and {run.name} differ in forecast.{differs[0]}, so {figure} cannot compare their "
+                "errors; leave one of them out."
+            )
+    found: dict[str, Any] = first.spec["forecast"]
+    return found
+
+
 def by_spec(runs: Sequence[RunRow]) -> list[list[RunRow]]:
     """Return runs of equal spec together, in the order of their first appearance."""
     return grouped(runs, lambda run: run.spec_hash)
+
+
+def every_spec(runs: Sequence[RunRow], methods: Sequence[str]) -> tuple[Group, ...]:
+    """Return a group with all runs of each spec: those of `methods` first, in this order, and then the others."""
+    places = {method: place for place, method in enumerate(methods)}
+    specs = sorted(by_spec(runs), key=lambda found: places.get(found[0].method, len(places)))
+    names = [found[0].method for found in specs]
+    groups = []
+    for found in specs:
+        method = found[0].method
+        label = method if names.count(method) == 1 else f"{method} {found[0].spec_hash[:8]}"
+        groups.append(Group(label, tuple(sorted(found, key=lambda run: run.seed))))
+    return tuple(groups)
+
+
+def fullest_profile(families: Mapping[str, Sequence[Family]]) -> str:
+    """Return the profile whose best specs have the most seeds over all methods; the newest on a tie."""
+
+    def fullness(profile: str) -> tuple[int, datetime]:
+        fitting = [[family for family in found if family.runs[0].profile == profile] for found in families.values()]
+        best = [max(found, key=lambda family: family.rank) for found in fitting if found]
+        return sum(family.seeds for family in best), max(family.runs[-1].started for family in best)
+
+    return max((family.runs[0].profile for found in families.values() for family in found), key=fullness)
+
+
+def choice_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
+    """Say which spec is drawn of a method, and how many other specs and unfinished runs of `stored` are not."""
+    first = group.runs[0]
+    others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
+    unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
+    seeds = ", ".join(str(run.seed) for run in group.runs)
+    note = f"{group.label}: spec {first.spec_hash[:8]} (profile {first.profile}), seeds {seeds}"
+    if not current:
+        note += "; not the spec that experiments.yaml gives now"
+    if others:
+        note += f"; {counted(others, 'other stored spec')} left out (choose with --runs)"
+    if unfinished:
+        note += f"; {counted(unfinished, 'unfinished run')} left out"
+    return f"{note}."
 
 
 def newest_of_each_seed(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:

@@ -13,8 +13,7 @@ Explicit run ids replace this choice: all of these runs are drawn, whatever thei
 apart as groups of their own; the runs of an ablation have to make one family.
 """
 
-from collections.abc import Callable, Mapping, Sequence, Set
-from datetime import datetime
+from collections.abc import Callable, Sequence, Set
 from typing import Any, NamedTuple
 
 from ssmail.config.experiments import (
@@ -32,10 +31,14 @@ from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted
 from ssmail.plots.run_groups import (
     ABSENT,
+    Family,
     Group,
     Selection,
     by_spec,
     check_one_data_set,
+    choice_note,
+    every_spec,
+    fullest_profile,
     grouped,
     newest_of_each_seed,
     rest_of,
@@ -73,23 +76,6 @@ class _Comparison(NamedTuple):
         where = ("--env", self.environment) if elsewhere else ()
         options = (*where, "--profile", profile or "quick", "--seeds", "0-4")
         return f"`{command_line('ssmail', 'ablate', self.ablation.name, *options)}`"
-
-
-class _Family(NamedTuple):
-    """Settled runs of one spec, or of specs that differ in the ablation's key alone."""
-
-    runs: tuple[RunRow, ...]  # newest last
-    current: bool  # whether experiments.yaml gives these specs now
-
-    @property
-    def seeds(self) -> int:
-        """How many different cells (a spec and a seed) there are."""
-        return len({(run.spec_hash, run.seed) for run in self.runs})
-
-    @property
-    def rank(self) -> tuple[bool, int, datetime]:
-        """The greater, the better for drawing."""
-        return self.current, self.seeds, self.runs[-1].started
 
 
 def figure_specs(figure: str, profile: str) -> dict[RunSpec, dict[str, Any]]:
@@ -201,15 +187,7 @@ def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
     if needed.ablation is not None:
         _check_one_family(needed.figure, needed.ablation.key, runs)
         return Selection(_groups_of_values(needed.ablation, runs, tuple), (), named=True)
-    places = {method: place for place, method in enumerate(needed.methods)}
-    specs = sorted(by_spec(runs), key=lambda found: places.get(found[0].method, len(places)))
-    methods = [found[0].method for found in specs]
-    groups = []
-    for found in specs:
-        method = found[0].method
-        label = method if methods.count(method) == 1 else f"{method} {found[0].spec_hash[:8]}"
-        groups.append(Group(label, tuple(sorted(found, key=lambda run: run.seed))))
-    return Selection(tuple(groups), (), named=True)
+    return Selection(every_spec(runs, needed.methods), (), named=True)
 
 
 def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
@@ -226,14 +204,14 @@ def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
             )
 
 
-def _families(needed: _Comparison, stored: Sequence[RunRow]) -> list[_Family]:
+def _families(needed: _Comparison, stored: Sequence[RunRow]) -> list[Family]:
     """The families of the settled runs. A single spec of an ablation is none, unless experiments.yaml gives it."""
     settled = [run for run in stored if run.state.settled]
     if (key := needed.key) is None:
-        return [_Family(tuple(runs), _is_current(needed, runs[0])) for runs in by_spec(settled)]
+        return [Family(tuple(runs), _is_current(needed, runs[0])) for runs in by_spec(settled)]
     varied = [run for run in settled if value_of(run, key) is not ABSENT]
     found = grouped(varied, lambda run: rest_of(run, key))
-    families = [_Family(tuple(runs), _is_current(needed, runs[0])) for runs in found]
+    families = [Family(tuple(runs), _is_current(needed, runs[0])) for runs in found]
     return [family for family in families if family.current or len(by_spec(family.runs)) > 1]
 
 
@@ -264,44 +242,17 @@ def _default_methods(store: Store, needed: _Comparison, profile: str | None) -> 
     families = {method: _families(needed, runs) for method, runs in stored.items()}
     if not any(families.values()):
         raise _no_runs(store, needed, profile, any_stored=bool(stored[needed.methods[0]]))
-    drawn_profile = profile or _fullest_profile(families)
+    drawn_profile = profile or fullest_profile(families)
     groups, notes, missing = [], [], []
     for method, found in families.items():
         fitting = [family for family in found if family.runs[0].profile == drawn_profile]
         if fitting:
             best = max(fitting, key=lambda family: family.rank)
             groups.append(Group(method, newest_of_each_seed(best.runs)))
-            notes.append(_method_note(groups[-1], best.current, stored[method]))
+            notes.append(choice_note(groups[-1], best.current, stored[method]))
         else:
             missing.append(f"{method} is missing; run {needed.command(method, drawn_profile)}.")
     return Selection(tuple(groups), (*notes, *missing))
-
-
-def _fullest_profile(families: Mapping[str, Sequence[_Family]]) -> str:
-    """The profile whose best specs have the most seeds over all methods; the newest on a tie."""
-
-    def fullness(profile: str) -> tuple[int, datetime]:
-        fitting = [[family for family in found if family.runs[0].profile == profile] for found in families.values()]
-        best = [max(found, key=lambda family: family.rank) for found in fitting if found]
-        return sum(family.seeds for family in best), max(family.runs[-1].started for family in best)
-
-    return max((family.runs[0].profile for found in families.values() for family in found), key=fullness)
-
-
-def _method_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
-    """Which spec is drawn, and how many other specs and unfinished runs are not."""
-    first = group.runs[0]
-    others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
-    unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
-    seeds = ", ".join(str(run.seed) for run in group.runs)
-    note = f"{group.label}: spec {first.spec_hash[:8]} (profile {first.profile}), seeds {seeds}"
-    if not current:
-        note += "; not the spec that experiments.yaml gives now"
-    if others:
-        note += f"; {counted(others, 'other stored spec')} left out (choose with --runs)"
-    if unfinished:
-        note += f"; {counted(unfinished, 'unfinished run')} left out"
-    return f"{note}."
 
 
 def _default_family(store: Store, needed: _Comparison, varied: Ablation, profile: str | None) -> Selection:

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 
 from ssmail.data.trajectories import Floats
 from ssmail.errors import printable, shortened
@@ -151,6 +151,12 @@ def epoch_axis(axes: Axes) -> None:
     """Make the x axis one of whole epochs."""
     axes.set_xlabel("epoch")
     axes.xaxis.set_major_locator(MaxNLocator("auto", integer=True, steps=[1, 2, 5, 10]))
+
+
+def step_axis(axes: Axes, steps: int) -> None:
+    """Make the x axis one of predicted steps, with ticks at the first, at the last and at the quarters between them."""
+    axes.set_xlabel("predicted step")
+    axes.xaxis.set_major_locator(FixedLocator(sorted({1, *(round(steps * part / 4) or 1 for part in (1, 2, 3, 4))})))
 
 
 def draw_reference(axes: Axes, error: float) -> Line2D:

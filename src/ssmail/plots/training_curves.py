@@ -3,8 +3,7 @@
 A panel for each metric; in each, the runs as thin lines and centre and spread of each group (`ssmail.plots.curves`).
 Runs are grouped by method, seed or any key of their spec. Runs of different specs are never averaged: a group that
 holds several is split, and its parts are told apart by the keys in which they differ. Of runs that were trained more
-than once (same spec, same seed) the newest with the metric is drawn. The scale is logarithmic where every value is
-positive and they span more than a factor of SPAN.
+than once (same spec, same seed) the newest with the metric is drawn. `curves.calls_for_logarithm` chooses the scale.
 """
 
 import difflib
@@ -31,7 +30,6 @@ from ssmail.plots.run_groups import Group, by_spec, check_one_data_set, newest_o
 from ssmail.store import RunRow, Store
 
 NAME = "training"
-SPAN = 30.0
 NEAREST = 3  # names of metrics that are offered for an unknown one
 HALF = 30  # characters of a small label that fits into half a column
 WIDEST = 40  # characters of a label that tells specs apart by their keys; where it is longer, the spec's hash does
@@ -47,8 +45,7 @@ class Panel:
     @property
     def logarithmic(self) -> bool:
         """Whether the values call for a logarithmic scale."""
-        values = np.concatenate([shown.finite for shown in self.bands])
-        return bool(len(values) and values.min() > 0 and values.max() > SPAN * values.min())
+        return curves.calls_for_logarithm(np.concatenate([shown.finite for shown in self.bands]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The contents of a report: judged claims, drawn figures, and all runs behind them."""
+"""The contents of a report: judged claims, compared runs on other data, drawn figures, and all runs behind them."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -6,13 +6,24 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ssmail.paper.claims import Part, Sample, Verdict
 from ssmail.paper.judgement import Judgement
 from ssmail.paper.report.drawing import Drawn
+from ssmail.plots.data_sets import DataSet
 from ssmail.store import RunRow, Store
-from ssmail.store.comparison import spec_differences
+from ssmail.store.comparison import Comparison, compare_runs, spec_differences
+
+
+@dataclass(frozen=True)
+class Table:
+    """The runs on one data set: a row for each spec, which has a Comparison for each metric."""
+
+    data: str
+    metrics: tuple[str, ...]
+    rows: tuple[tuple[Comparison, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -22,7 +33,8 @@ class Report:
     database: str
     command: str  # that produces this report, including its runs
     written: datetime
-    judgements: tuple[Judgement, ...]
+    judgements: tuple[Judgement, ...]  # none in a report on other data than the paper's
+    tables: tuple[Table, ...]
     figures: tuple[Drawn, ...]
     runs: tuple[RunRow, ...]  # by environment, method, spec and seed
     differs: Mapping[str, Mapping[str, Any]]  # by spec hash: see spec_differences
@@ -53,9 +65,15 @@ def gather(
     judgements: Sequence[Judgement],
     command: str,
     unfinished: Sequence[str] = (),
+    data: Sequence[DataSet] = (),
+    metrics: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> Report:
-    """Return the report on these figures and judgements, with all of their runs."""
-    wanted = {run for found in judgements for run in found.runs}
+    """Return the report on these figures and judgements, with all of their runs.
+
+    The runs of each set of `data` are compared by those of the `metrics` of its environment that any of them has.
+    """
+    wanted = {run.id for each in data for run in each.runs}
+    wanted |= {run for found in judgements for run in found.runs}
     wanted |= {run for drawn in figures if drawn.provenance for run in drawn.provenance.run_ids}
     runs = sorted(
         (run for run in store.runs() if run.id in wanted),
@@ -66,11 +84,20 @@ def gather(
         command=command,
         written=datetime.now(UTC),
         judgements=tuple(judgements),
+        tables=tuple(_compared(store, each, metrics[each.environment]) for each in data),
         figures=tuple(figures),
         runs=tuple(runs),
         differs=spec_differences(runs),
         unfinished=tuple(unfinished),
     )
+
+
+def _compared(store: Store, data: DataSet, metrics: Sequence[str]) -> Table:
+    found = compare_runs(store, data.runs, metrics)
+    known = tuple(name for name in metrics if any(item.known for item in found if item.metric == name))
+    specs = dict.fromkeys(item.spec_hash for item in found)
+    rows = (tuple(item for item in found if item.spec_hash == spec and item.metric in known) for spec in specs)
+    return Table(data.name, known, tuple(rows))
 
 
 def _nearby(where: str) -> str:

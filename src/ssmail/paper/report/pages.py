@@ -19,7 +19,8 @@ from ssmail.paper.claims import Verdict
 from ssmail.paper.report.contents import Report, samples_of
 from ssmail.paper.report.drawing import Drawn
 from ssmail.plots import formatting
-from ssmail.store import RunRow
+from ssmail.store import RunRow, RunState
+from ssmail.store.comparison import Comparison
 
 MARKDOWN, HTML = "report.md", "report.html"
 TEMPLATES = Path(__file__).with_name("templates")
@@ -120,6 +121,8 @@ def _environment(autoescape: bool, finalize: Callable[[Any], Any]) -> Environmen
         "samples": samples_of,
         "differences": _differences,
         "whole": _whole,
+        "mean": _mean,
+        "seeds": _seeds,
     }
     environment.globals |= {"version": __version__, "counted": formatting.counted}
     return environment
@@ -128,6 +131,19 @@ def _environment(autoescape: bool, finalize: Callable[[Any], Any]) -> Environmen
 def _differences(values: Mapping[str, Any]) -> str:
     """Format the keys in which a spec differs from others: "beta 0.15, epochs 40"."""
     return ", ".join(f"{key.rpartition('.')[2]} {formatting.setting(value)}" for key, value in values.items())
+
+
+def _mean(item: Comparison) -> str:
+    """Format the mean over the seeds, with the standard deviation: "0.0123 ± 0.0011"."""
+    spread = f" ± {formatting.number(item.std, 2)}" if item.std is not None else ""
+    return f"{formatting.number(item.mean)}{spread}"
+
+
+def _seeds(item: Comparison) -> str:
+    """Format the seeds, with the state of those that did not finish: "0-2, 3 diverged"."""
+    ended = [seed for seed, state in item.states.items() if state is RunState.FINISHED]
+    others = [f"{seed} {state}" for seed, state in item.states.items() if state is not RunState.FINISHED]
+    return ", ".join([formatting.spans(ended)] * bool(ended) + others)
 
 
 def _whole(run: RunRow) -> Markup:
