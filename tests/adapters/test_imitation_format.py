@@ -29,7 +29,9 @@ def with_fewer_agents(whole: Trajectories) -> Trajectories:
 
 @settings(max_examples=10, deadline=None)
 @given(axes=st.integers(1, 3), agents=st.integers(1, 4), steps=st.integers(2, 9), seed=st.integers(0, 99))
-def test_windows_come_back(tmp_path_factory: pytest.TempPathFactory, axes: int, agents: int, steps: int, seed: int) -> None:
+def test_windows_come_back(
+    tmp_path_factory: pytest.TempPathFactory, axes: int, agents: int, steps: int, seed: int
+) -> None:
     written = windows(axes, agents, steps=steps, seed=seed)
     folder = tmp_path_factory.mktemp("set") / "train"
     write_imitation(written, folder)
@@ -54,7 +56,9 @@ def test_imitation_loads_what_was_written(tmp_path: Path) -> None:
     assert len(loaded) == 4
     for b, trajectory in enumerate(loaded):
         assert trajectory.obs.shape == (7, 12)
-        np.testing.assert_array_equal(trajectory.obs[3, 4:8], [*written.positions[b, 3, 1], *written.velocities[b, 3, 1]])
+        np.testing.assert_array_equal(
+            trajectory.obs[3, 4:8], [*written.positions[b, 3, 1], *written.velocities[b, 3, 1]]
+        )
         np.testing.assert_array_equal(trajectory.acts, written.velocities[b, 1:].reshape(6, 6))
         assert not trajectory.terminal
         assert list(trajectory.infos) == [{}] * 6

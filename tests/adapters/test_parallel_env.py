@@ -67,9 +67,7 @@ def played(env: TrajectoryEnv, window: int, actions: np.ndarray) -> tuple[np.nda
 
 
 @pytest.mark.parametrize("observed", [1, 5])
-def test_the_experts_velocities_lead_along_its_path_to_the_end_of_the_window(
-    experts: ExpertSet, observed: int
-) -> None:
+def test_the_experts_velocities_lead_along_its_path_to_the_end_of_the_window(experts: ExpertSet, observed: int) -> None:
     env, windows = TrajectoryEnv(experts, "test", observed=observed), experts.test
     states, ends = played(env, 1, windows.velocities[1, observed:])
     axes = windows.positions.shape[-1]

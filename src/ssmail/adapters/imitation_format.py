@@ -57,9 +57,7 @@ def write_imitation(trajectories: Trajectories, folder: Path) -> None:
         raise InputError(f"cannot write {folder}: {error.strerror or error}; choose a writable folder") from error
 
 
-def read_imitation(
-    folder: Path, *, axes: int = 2, positions: Callable[[Floats], Any] | None = None
-) -> list[Floats]:
+def read_imitation(folder: Path, *, axes: int = 2, positions: Callable[[Floats], Any] | None = None) -> list[Floats]:
     """Return the positions (F, N, P) of each trajectory in a folder, in raw units.
 
     positions: turns the observations (T, D) of a trajectory into positions (T, N, P). Without it the observations must
@@ -83,8 +81,9 @@ def _frames(observations: Floats, axes: int, positions: Callable[[Floats], Any] 
                 f"{label} has {size} numbers in an observation, not positions and velocities on {axes} axes; give "
                 "`axes`, or `positions`, which picks them out"
             )
-        states = observations.reshape(length, -1, 2 * axes)
-        frames = np.concatenate([states[:1, :, :axes] - states[:1, :, axes:], states[..., :axes]])
+        places, velocities = np.split(observations.reshape(length, -1, 2 * axes), 2, axis=-1)
+        with np.errstate(invalid="ignore", over="ignore"):
+            frames = np.concatenate([places[:1] - velocities[:1], places])
     else:
         frames = np.asarray(positions(observations), dtype=np.float64)
         if frames.ndim != 3 or len(frames) != length or not 1 <= frames.shape[2] <= 3 or not frames.shape[1]:

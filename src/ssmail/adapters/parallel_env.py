@@ -106,9 +106,7 @@ class TrajectoryEnv(ParallelEnv):  # type: ignore[misc]
 
     def step(
         self, actions: Mapping[str, Any]
-    ) -> tuple[
-        dict[str, Floats], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
-    ]:
+    ) -> tuple[dict[str, Floats], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
         """Move all agents by their actions. After the end of an episode there are no agents, and nothing moves."""
         agents = self.agents
         taken = np.zeros((len(self.possible_agents), self._axes))
@@ -139,5 +137,6 @@ class TrajectoryEnv(ParallelEnv):  # type: ignore[misc]
 
     def _observations(self) -> dict[str, Floats]:
         rows = np.arange(len(self.possible_agents))
-        return {agent: self._now[np.argsort(rows != row, kind="stable")].ravel() for row, agent in enumerate(self.agents)}
-
+        return {
+            agent: self._now[np.argsort(rows != row, kind="stable")].ravel() for row, agent in enumerate(self.agents)
+        }
