@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import LettersSpec, YJunctionSpec
-from ssmail.data import expert_sets, letters, yjunction
+from ssmail.data import expert_sets, letters, npz_file, yjunction
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError
@@ -185,7 +185,7 @@ def array(data: Any, dtype: Any = None) -> bytes:
     return file.getvalue()
 
 
-def header(dtype: str, shape: str, fortran: str = "False", magic: bytes = expert_sets.MAGIC, length: int = -1) -> bytes:
+def header(dtype: str, shape: str, fortran: str = "False", magic: bytes = npz_file.MAGIC, length: int = -1) -> bytes:
     """The beginning of a .npy file, as numpy writes it but for what it says."""
     text = f"{{'descr': '{dtype}', 'fortran_order': {fortran}, 'shape': {shape}, }}\n".encode()
     return magic + struct.pack("<H", (len(text) if length < 0 else length) % 2**16) + text
@@ -206,7 +206,7 @@ def changed_member(name: str, data: bytes) -> st.SearchStrategy[tuple[str, bytes
         st.sampled_from(DTYPES),
         st.sampled_from(SHAPES),
         st.sampled_from(["False", "True", "None", "1", "__import__('this')"]),
-        st.sampled_from([expert_sets.MAGIC, b"\x93NUMPY\x02\x00", b"\x93NUMPY\x03\x00", b"PK\3\4"]),
+        st.sampled_from([npz_file.MAGIC, b"\x93NUMPY\x02\x00", b"\x93NUMPY\x03\x00", b"PK\3\4"]),
         st.sampled_from([-1, -1, 0, 10, 65535]),
     )
     contents = st.one_of(
@@ -425,7 +425,7 @@ def test_members_that_lie_on_one_another(tmp_path: Path, valid: Valid) -> None:
 
 def test_a_file_larger_than_any_set(tmp_path: Path, valid: Valid, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.npz").write_bytes(valid["yjunction"])
-    monkeypatch.setattr(expert_sets, "LARGEST_FILE", len(valid["yjunction"]) - 1)
+    monkeypatch.setattr(npz_file, "LARGEST_FILE", len(valid["yjunction"]) - 1)
     with pytest.raises(InputError, match="is larger than any expert set"):
         expert_sets.load(tmp_path / "a.npz")
 
@@ -522,13 +522,13 @@ def test_a_file_that_shrinks_while_it_is_read(
 ) -> None:
     path = tmp_path / "a.npz"
     path.write_bytes(valid["yjunction"])
-    complete = expert_sets._File.require_exactly
+    complete = npz_file.NpzFile.require_exactly
 
-    def shrink(file: expert_sets._File, *keys: str) -> None:
+    def shrink(file: npz_file.NpzFile, *keys: str) -> None:
         complete(file, *keys)
         os.truncate(path, size)
 
-    monkeypatch.setattr(expert_sets._File, "require_exactly", shrink)
+    monkeypatch.setattr(npz_file.NpzFile, "require_exactly", shrink)
     with pytest.raises(InputError, match=r"is truncated or not an .npz file"):
         expert_sets.load(path)
 

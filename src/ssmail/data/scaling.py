@@ -7,6 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 
+def ends(values: NDArray[np.float64], present: NDArray[np.bool_] | None = None) -> tuple[float, float]:
+    """Return the least and the largest of the values, or of those that are `present` (a mask to broadcast)."""
+    if present is None:
+        return float(values.min()), float(values.max())
+    return float(values.min(where=present, initial=np.inf)), float(values.max(where=present, initial=-np.inf))
+
+
 @dataclass(frozen=True)
 class Scaling:
     """The minimum and maximum of the training positions and velocities over all agents and axes, in raw units."""
@@ -17,9 +24,14 @@ class Scaling:
     velocity_max: float
 
     @classmethod
-    def fit(cls, positions: NDArray[np.float64], velocities: NDArray[np.float64]) -> Self:
-        """Fit to arrays of any shape in raw units. Raises ValueError if a range is empty or not finite."""
-        scaling = cls(*(float(f(x)) for x in (positions, velocities) for f in (np.min, np.max)))
+    def fit(
+        cls, positions: NDArray[np.float64], velocities: NDArray[np.float64], present: NDArray[np.bool_] | None = None
+    ) -> Self:
+        """Fit to arrays of any shape in raw units, or to the values that are `present` of them (a mask to broadcast).
+
+        Raises ValueError if a range is empty or not finite.
+        """
+        scaling = cls(*(end for array in (positions, velocities) for end in ends(array, present)))
         spans = (scaling.position_span, scaling.velocity_span)
         if not all(np.isfinite(s) and s > 0 for s in spans):
             raise ValueError(f"positions and velocities need a positive finite range, not {spans}")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssmail.config.sections import LettersSpec, YJunctionSpec
-from ssmail.data.scaling import Scaling
+from ssmail.data.scaling import Scaling, ends
 
 Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes
 Integers = NDArray[np.int64]
@@ -19,6 +19,7 @@ FIELDS = {  # environment -> the arrays of a split that are hashed and stored, i
     "yjunction": ("positions", "velocities", "mode", "continuations"),
     "letters": ("positions", "velocities", "mode"),
     "mocap": ("positions", "velocities", "mode", "trial", "frame"),
+    "trajectories": ("positions", "velocities", "agents", "scene", "frame"),
 }
 
 
@@ -31,6 +32,9 @@ class Trajectories:
     continuations: (L, B, T, N, P) the expert's positions from the same starts into each of its L modes.
     trial, frame: (B,) for recorded motion, the trial that each trajectory was cut from and the number of its first
     frame there; None otherwise.
+    agents: (B,) how many agents each trajectory has: the first so many of the N; the rest is padding, zero in all
+    arrays. None if all have N.
+    scene: (B,) for sets of trajectories, the index of the scene that each was cut from; None otherwise.
     """
 
     positions: Floats
@@ -39,14 +43,29 @@ class Trajectories:
     continuations: Floats
     trial: Integers | None = None
     frame: Integers | None = None
+    agents: Integers | None = None
+    scene: Integers | None = None
 
     @classmethod
     def single_mode(
-        cls, positions: Floats, velocities: Floats, trial: Integers | None = None, frame: Integers | None = None
+        cls,
+        positions: Floats,
+        velocities: Floats,
+        trial: Integers | None = None,
+        frame: Integers | None = None,
+        agents: Integers | None = None,
+        scene: Integers | None = None,
     ) -> "Trajectories":
         """Trajectories (B, T, N, P) of an expert with one mode: the continuation is the trajectory itself."""
         mode = np.zeros(len(positions), dtype=np.int64)
-        return cls(positions, velocities, mode, positions[None], trial, frame)
+        return cls(positions, velocities, mode, positions[None], trial, frame, agents, scene)
+
+    @property
+    def present(self) -> NDArray[np.bool_] | None:
+        """(B, 1, N, 1) whether there is such an agent, to broadcast over positions; None if there always is."""
+        if self.agents is None:
+            return None
+        return (np.arange(self.positions.shape[2]) < self.agents[:, None])[:, None, :, None]
 
     def __len__(self) -> int:
         return len(self.positions)
@@ -58,8 +77,7 @@ class Trajectories:
             self.velocities[index],
             self.mode[index],
             self.continuations[:, index],
-            None if self.trial is None else self.trial[index],
-            None if self.frame is None else self.frame[index],
+            *(None if of is None else of[index] for of in (self.trial, self.frame, self.agents, self.scene)),
         )
 
 
@@ -70,10 +88,11 @@ class ExpertSet:
     centre_lines: (L, P', P) points of each mode's centre line in raw units; for letters, (N, P', P) the letter that
     each agent draws; empty for recorded motion.
     parameters: what the set was made from. Without an "environment" it is a yjunction set.
-    hash: SHA-256 of the parameters, the skeleton and the arrays.
+    hash: SHA-256 of the parameters, the skeleton, the names of the scenes and the arrays.
     joints, parents: for the joints of a skeleton, their N names and the index of each one's parent, -1 for the root;
     empty for other agents.
     sources: the files that the set was made from, with their SHA-256; not part of `hash`.
+    scenes: for sets of trajectories, the names of the scenes that `Trajectories.scene` counts; empty otherwise.
     """
 
     train: Trajectories
@@ -85,6 +104,7 @@ class ExpertSet:
     joints: tuple[str, ...] = ()
     parents: tuple[int, ...] = ()
     sources: Mapping[str, str] = field(default_factory=dict)
+    scenes: tuple[str, ...] = ()
 
     @classmethod
     def bundle(
@@ -95,18 +115,22 @@ class ExpertSet:
         joints: tuple[str, ...] = (),
         parents: tuple[int, ...] = (),
         sources: Mapping[str, str] | None = None,
+        scenes: tuple[str, ...] = (),
     ) -> "ExpertSet":
         """Put the splits together and compute their hash. The sources stay out of it: the same numbers from files with
         other line ends are the same data.
         """
-        described = [parameters, joints, parents] if joints else parameters
+        names = [joints, parents] if joints else [scenes] if scenes else []
+        described = [parameters, *names] if names else parameters
         digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
         fields = FIELDS[str(parameters.get("environment", "yjunction"))]
         for array in (*(getattr(splits[split], name) for split in SPLITS for name in fields), centre_lines):
             digest.update(np.ascontiguousarray(array).tobytes())
         train, validation, test = (splits[split] for split in SPLITS)
         made_from = dict(sources or {})
-        return cls(train, validation, test, centre_lines, parameters, digest.hexdigest(), joints, parents, made_from)
+        return cls(
+            train, validation, test, centre_lines, parameters, digest.hexdigest(), joints, parents, made_from, scenes
+        )
 
     @property
     def environment(self) -> str:
@@ -116,7 +140,7 @@ class ExpertSet:
     @property
     def scaling(self) -> Scaling:
         """The scaling to [-1, 1], fitted to the training split only."""
-        return Scaling.fit(self.train.positions, self.train.velocities)
+        return Scaling.fit(self.train.positions, self.train.velocities, self.train.present)
 
     @property
     def is_scalable(self) -> bool:
@@ -125,15 +149,14 @@ class ExpertSet:
             scaling = self.scaling
         except ValueError:
             return False
-        splits = (self.train, self.validation, self.test)
-        places = [self.centre_lines, *(array for split in splits for array in (split.positions, split.continuations))]
-        scaled = [scaling.scale_positions(float(end)) for array in places if array.size for end in _ends(array)]
-        scaled += [scaling.scale_velocities(float(end)) for split in splits for end in _ends(split.velocities)]
+        positions = [ends(self.centre_lines)] if self.centre_lines.size else []
+        velocities = []
+        for split in (self.train, self.validation, self.test):
+            positions += [ends(array, split.present) for array in (split.positions, split.continuations) if array.size]
+            velocities.append(ends(split.velocities, split.present))
+        scaled = [scaling.scale_positions(end) for pair in positions for end in pair]
+        scaled += [scaling.scale_velocities(end) for pair in velocities for end in pair]
         return all(abs(value) <= LARGEST_SCALED for value in scaled)
-
-
-def _ends(array: Floats) -> tuple[np.float64, np.float64]:
-    return array.min(), array.max()
 
 
 def generate_splits(
