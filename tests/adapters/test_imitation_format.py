@@ -107,11 +107,11 @@ def test_what_cannot_be_read_ends_as_one_sentence(tmp_path: Path) -> None:
     write_imitation(windows(), tmp_path / "train")
     with pytest.raises(InputError, match="exists already"):
         write_imitation(windows(), tmp_path / "train")
-    with pytest.raises(InputError, match="trajectory 0 in .*train has 12 numbers .* on 5 axes"):
+    with pytest.raises(InputError, match=r"trajectory 0 in .*train has 12 numbers .* on 5 axes"):
         read_imitation(tmp_path / "train", axes=5)
     with pytest.raises(InputError, match=r"`positions` makes \(7,\) of trajectory 0"):
         read_imitation(tmp_path / "train", positions=lambda obs: obs[:, 0])
-    with pytest.raises(InputError, match="trajectory 0 .* NaN"):
+    with pytest.raises(InputError, match=r"trajectory 0 .* NaN"):
         read_imitation(tmp_path / "train", positions=lambda obs: obs.reshape(7, -1, 2) * np.nan)
     with pytest.raises(InputError, match="is not a folder"):
         read_imitation(tmp_path / "absent")

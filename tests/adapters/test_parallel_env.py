@@ -129,5 +129,5 @@ def test_bad_arguments_end_as_one_sentence() -> None:
     with pytest.raises(InputError, match="20 observed states leave no step of windows of 20; observe 1 to 19"):
         TrajectoryEnv(experts, observed=20)
     for window in (6, -1, "first"):
-        with pytest.raises(InputError, match="there is no window .*; the split has the windows 0 to 5"):
+        with pytest.raises(InputError, match=r"there is no window .*; the split has the windows 0 to 5"):
             TrajectoryEnv(experts).reset(options={"window": window})

@@ -1,11 +1,12 @@
 """Trajectories in the format of the library `imitation`: folders that `imitation.data.serialize` loads and saves.
 
 A trajectory is one window with all its agents, as a single learner would see them. `obs` (T, N * 2P) holds
-[position, velocity] of one agent after the other; `acts` (T - 1, N * P) their next velocities in the same order; `infos`
-are empty; `terminal` is false, because windows end by truncation. There are no rewards. All is in raw units.
+[position, velocity] of one agent after the other; `acts` (T - 1, N * P) their next velocities in the same order;
+`infos` are empty; `terminal` is false, because windows end by truncation. There are no rewards. All is in raw units.
 
-Such a folder may come from anyone. `imitation` itself decodes the `infos` with jsonpickle, which can run code, and opens
-the files that the folder names, wherever they are. Here the `infos` are not read, and only files within the folder are.
+Such a folder may come from anyone. `imitation` itself decodes the `infos` with jsonpickle, which can run code, and
+opens the files that the folder names, wherever they are. Here the `infos` are not read, and of files only those within
+the folder are.
 """
 
 import re
