@@ -10,7 +10,7 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError, shortened
-from ssmail_cli import claims, datasets, db, explain, plot, report, reproduce, runs, train
+from ssmail_cli import claims, datasets, db, explain, import_data, plot, report, reproduce, runs, train
 from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, print_remarks, say
 
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
@@ -26,6 +26,7 @@ app = typer.Typer(
 app.command("generate-yjunction")(datasets.generate_yjunction)
 app.command("generate-letters")(datasets.generate_letters)
 app.command("prep-mocap")(datasets.prep_mocap)
+app.command("import-data")(import_data.import_data)
 app.command("train")(train.train)
 app.command("ablate")(train.ablate)
 app.command("ablate-alpha", cls=train.AblateAlias, help="Short for `ssmail ablate alpha`.")(train.ablate)

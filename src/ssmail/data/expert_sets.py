@@ -25,7 +25,7 @@ from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap
 from ssmail.data.mocap.acclaim_lines import is_name
-from ssmail.data.npz_file import LARGEST_FILE, LONGEST_TEXT, MAGIC, NpzFile, broken
+from ssmail.data.npz_file import LARGEST_FILE, LONGEST_TEXT, MAGIC, NpzFile, again, broken
 from ssmail.data.recorded_sets import SetParameters, recorded_set
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError, command_line
@@ -108,7 +108,7 @@ def load(path: Path, environment: str | None = None) -> ExpertSet:
             if contents.peek(len(MAGIC)).startswith(MAGIC):
                 raise broken(f"{path} is a single array, not an .npz of ssmail", command)
             with zipfile.ZipFile(contents) as archive:
-                return _load(NpzFile(path, command, archive, os.fstat(contents.fileno()).st_size), environment)
+                return _load(NpzFile(path, again(command), archive, os.fstat(contents.fileno()).st_size), environment)
     except FileNotFoundError:
         remedy = command_line(*command.split(), "--out", path)
         raise InputError(f"there is no file {path}; make it with `{remedy}`") from None
@@ -130,7 +130,7 @@ def _load(file: NpzFile, environment: str | None) -> ExpertSet:
             f"{file.path} is an expert set of {found}, not of {environment}; train with --env {found}, or name another "
             "set in data.path"
         )
-    file.command = COMMANDS[found]
+    file.remedy = again(COMMANDS[found])
     split_arrays = (f"{split}/{field}" for split in SPLITS for field in FIELDS[found])
     file.require_exactly("parameters", "hash", *OTHER_ARRAYS[found], *split_arrays)
     try:

@@ -6,7 +6,7 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Self
 
 import numpy as np
 
@@ -24,14 +24,18 @@ HEADER = re.compile(
 
 def broken(what: str, command: str) -> InputError:
     """Return the error to raise for a file that `command` makes."""
-    return InputError(f"{what}; make it again with `{command} --force`")
+    return InputError(f"{what}; {again(command)}")
+
+
+def again(command: str) -> str:
+    """Return the remedy for a file that `command` makes."""
+    return f"make it again with `{command} --force`"
 
 
 @dataclass(frozen=True)
 class Header:
-    """What the .npy member of an archive declares about its array, and where the data begin."""
+    """What a .npy file, or a member of an archive, declares about its array, and where the data begin."""
 
-    member: zipfile.ZipInfo
     dtype: np.dtype[Any]
     shape: tuple[int, ...]
     fortran: bool
@@ -42,26 +46,55 @@ class Header:
         """How many elements the array has."""
         return math.prod(self.shape)
 
+    @property
+    def size(self) -> int:
+        """How many bytes the file has."""
+        return self.begin + self.count * self.dtype.itemsize
+
+    @classmethod
+    def read(cls, file: IO[bytes]) -> Self | None:
+        """Read the header, which numpy would evaluate as Python; None if it is not of numbers or text."""
+        start = file.read(len(MAGIC) + 2)
+        length = int.from_bytes(start[len(MAGIC) :], "little")
+        found = HEADER.fullmatch(file.read(min(length, LONGEST_HEADER)))
+        if not start.startswith(MAGIC) or not found:
+            return None
+        dtype, fortran, sizes = (group.decode() for group in found.groups())
+        shape = tuple(int(size) for size in sizes.split(",") if size.strip())
+        return cls(np.dtype(dtype), shape, fortran == "True", len(MAGIC) + 2 + length)
+
+    def values(self, file: IO[bytes]) -> Any:
+        """Read the array from a file that is open where its data begin. Raises ValueError if data are missing."""
+        data = read_whole(file, self.count * self.dtype.itemsize) or bytearray()
+        if self.dtype.kind == "U":
+            data.decode("utf-32-le")  # raises UnicodeDecodeError for what is no text; numpy trusts it
+        array = np.frombuffer(data, self.dtype)
+        return array.reshape(self.shape[::-1]).T if self.fortran else array.reshape(self.shape)
+
 
 class NpzFile:
-    """The arrays of an open .npz file, and the command that makes such a file.
+    """The arrays of an open .npz file, and what makes a good one.
 
     Raises InputError, as do all methods, or one of ARCHIVE_ERRORS if a member or an array is not as it should be.
     """
 
-    def __init__(self, path: Path, command: str, archive: zipfile.ZipFile, size: int) -> None:
-        """Check the members, and read their headers. size: of the file, in bytes."""
-        self.path, self.command, self.archive = path, command, archive
+    def __init__(self, path: Path, remedy: str, archive: zipfile.ZipFile, size: int, *, packed: bool = False) -> None:
+        """Check the members, and read their headers. size: of the file, in bytes. packed: whether they may be deflated,
+        up to LARGEST_FILE altogether.
+        """
+        self.path, self.remedy, self.archive = path, remedy, archive
         self.headers: dict[str, Header] = {}
+        self.members: dict[str, zipfile.ZipInfo] = {}
         members = archive.infolist()
         if size > LARGEST_FILE or len(members) > MOST_ARRAYS:
             raise self.fault(f"{path} is larger than any expert set of ssmail")
         for member in members:
-            if not is_plain(member) or member.compress_type != zipfile.ZIP_STORED:
+            if not is_plain(member) or not (packed or member.compress_type == zipfile.ZIP_STORED):
                 raise self.fault(
                     f"{member.filename!r:.40} in {path} is compressed or encrypted, which ssmail never does"
                 )
-        if sum(member.file_size for member in members) > size:  # as members that lie on one another do
+        most = LARGEST_FILE if packed else size
+        if sum(member.file_size for member in members) > most:  # as members that lie on one another do
             raise self.fault(f"{path} declares more than it holds")
         for member in members:
             key = member.filename.removesuffix(".npy")
@@ -70,23 +103,18 @@ class NpzFile:
             self.headers[key] = self._header(key, member)
 
     def _header(self, key: str, member: zipfile.ZipInfo) -> Header:
-        """Read the header of a .npy member, which numpy would evaluate as Python."""
         with self.archive.open(member) as file:
-            start = file.read(len(MAGIC) + 2)
-            length = int.from_bytes(start[len(MAGIC) :], "little")
-            found = HEADER.fullmatch(file.read(min(length, LONGEST_HEADER)))
-        if not start.startswith(MAGIC) or not found:
+            header = Header.read(file)
+        if header is None:
             raise self.fault(f"{key!r:.40} in {self.path} is no array of numbers or text")
-        dtype, fortran, sizes = (group.decode() for group in found.groups())
-        shape = tuple(int(size) for size in sizes.split(",") if size.strip())
-        header = Header(member, np.dtype(dtype), shape, fortran == "True", len(MAGIC) + 2 + length)
-        if header.begin + header.count * header.dtype.itemsize != member.file_size:
+        if header.size != member.file_size:
             raise self.fault(f"{key!r:.40} in {self.path} is not as large as its shape says")
+        self.members[key] = member
         return header
 
     def fault(self, what: str) -> InputError:
         """Return the error to raise; the remedy is always the same."""
-        return broken(what, self.command)
+        return InputError(f"{what}; {self.remedy}")
 
     def header(self, key: str) -> Header:
         """Return what is declared of an array."""
@@ -102,6 +130,13 @@ class NpzFile:
             if key not in keys:
                 raise self.fault(f"{self.path} holds {key!r:.40}, which is no array of such an expert set")
 
+    def values(self, key: str) -> Any:
+        """Return an array with whatever shape and values it has."""
+        header = self.header(key)
+        with self.archive.open(self.members[key]) as file:
+            file.read(header.begin)
+            return header.values(file)
+
     def array(self, key: str, shape: tuple[int, ...], kind: type[np.generic]) -> Any:
         """Return an array, checked to have this shape and this kind of values, all finite."""
         header = self.header(key)
@@ -109,13 +144,7 @@ class NpzFile:
             raise self.fault(f"{key} in {self.path} has shape {header.shape!s:.40} instead of {shape!s:.40}")
         if not np.issubdtype(header.dtype, kind):
             raise self.fault(f"{key} in {self.path} holds {header.dtype} values")
-        with self.archive.open(header.member) as file:
-            file.read(header.begin)
-            data = read_whole(file, header.member.file_size - header.begin) or bytearray()
-        if kind is np.str_:
-            data.decode("utf-32-le")  # raises UnicodeDecodeError for what is no text; numpy trusts it
-        array = np.frombuffer(data, header.dtype)
-        array = array.reshape(shape[::-1]).T if header.fortran else array.reshape(shape)
+        array = self.values(key)
         if kind is np.float64 and not np.isfinite(array).all():
             raise self.fault(f"{key} in {self.path} holds NaN or infinite values")
         return array
@@ -136,7 +165,7 @@ class NpzFile:
 
     def text(self, key: str) -> str:
         """Return an array that is a single text."""
-        if self.header(key).member.file_size > LONGEST_TEXT:
+        if self.header(key).size > LONGEST_TEXT:
             raise self.fault(f"{key} in {self.path} is longer than in any expert set of ssmail")
         return str(self.array(key, (), np.str_)[()])
 

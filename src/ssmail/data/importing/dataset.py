@@ -1,0 +1,149 @@
+"""Import anyone's recorded agents: from files to an expert set (docs/data-format.md)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ssmail.data.importing.cutting import Windows, check_size, cut, longest, nearest
+from ssmail.data.importing.rows import Rows, quoted
+from ssmail.data.importing.sources import find_files, read_files
+from ssmail.data.importing.splitting import Shares, split_scenes, split_times
+from ssmail.data.importing.summary import Summary, summarize
+from ssmail.data.importing.tables import Columns
+from ssmail.data.importing.tracks import Tracks, make_tracks
+from ssmail.data.recorded_sets import SetParameters, recorded_set, windows
+from ssmail.data.trajectories import SPLITS, ExpertSet, Integers, Trajectories
+from ssmail.errors import InputError
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """How rows become windows. observed: of a window, half of it by default. stride: by default what is predicted.
+
+    most_agents: of a window; None for all. The other fields are those of SetParameters.
+    """
+
+    columns: Columns = field(default_factory=Columns)
+    dt: float | None = None
+    window: int = 50
+    observed: int | None = None
+    stride: int | None = None
+    fill_gaps: int = 0
+    least_agents: int = 1
+    most_agents: int | None = None
+    split: Shares = (70, 15, 15)
+
+    def parameters(self, axes: int) -> SetParameters:
+        """Return the parameters of a set. Raises InputError unless something of a window is observed and predicted."""
+        observed = self.window // 2 if self.observed is None else self.observed
+        if not 1 <= observed < self.window:
+            raise InputError(
+                f"of a window of {self.window} frames, {observed} cannot be observed; give --observed from 1 to "
+                f"{self.window - 1}, or another --window"
+            )
+        if self.most_agents is not None and self.most_agents < self.least_agents:
+            raise InputError(f"--agents {self.most_agents} is less than --least-agents {self.least_agents}; swap them")
+        return SetParameters(
+            axes=axes,
+            window=self.window,
+            observed=observed,
+            predicted=self.window - observed,
+            stride=self.stride or self.window - observed,
+            dt=self.dt,
+            fill_gaps=self.fill_gaps,
+            least_agents=self.least_agents,
+            most_agents=self.most_agents,
+            split=self.split,
+        )
+
+
+def import_set(
+    sources: Sequence[Path], options: ImportOptions, report: Callable[[str], None] = lambda _: None
+) -> tuple[ExpertSet, Summary]:
+    """Make an expert set from files, or from all those in folders. report: is told which file is being read.
+
+    Raises InputError for anything in the files that cannot be used, and if there is no window for each split.
+    """
+    options.parameters(1)
+    files = find_files(sources)
+    rows, digests = read_files(files, options.columns, report)
+    params = options.parameters(rows.positions.shape[1])
+    tracks, repairs = make_tracks(rows, options.dt, options.fill_gaps)
+    parts, params = _parts(tracks, rows, params)
+    if params.most_agents is not None:
+        parts = [nearest(part, params.most_agents, params.observed) for part in parts]
+    agents = max(int(part.agents.max()) for part in parts)
+    check_size(parts, agents)
+    params = params.model_copy(update={"identity": _alike(parts)})
+    used, numbers = np.unique(np.concatenate([part.scene for part in parts]), return_inverse=True)
+    scenes = [rows.scenes[scene] for scene in used]
+    splits, begin = {}, 0
+    for split, part in zip(SPLITS, parts, strict=True):
+        splits[split] = _trajectories(part, agents, numbers[begin : begin + len(part)])
+        begin += len(part)
+    experts = recorded_set(splits, scenes, params, digests)
+    _check_scaling(experts, sources)
+    return experts, summarize(rows, tracks, repairs, parts, params, len(files))
+
+
+def _parts(tracks: Tracks, rows: Rows, params: SetParameters) -> tuple[list[Windows], SetParameters]:
+    """Cut the windows of each split, and return them with the parameters that say how it was split."""
+    frames, stride, least = params.window + 1, params.stride, params.least_agents
+    start = np.zeros(len(rows.scenes), dtype=np.int64)
+    found = np.bincount(cut(tracks, start, frames, stride, least).scene, minlength=len(start))
+    by_scene = np.count_nonzero(found) >= len(SPLITS)
+    if by_scene:
+        split = split_scenes(rows.scenes, found, params.split)
+        blocks = [(tracks[split[tracks.scene] == number], start) for number in range(len(SPLITS))]
+    else:
+        blocks = split_times(tracks, len(start), params.split)
+    parts = [cut(part, begin, frames, stride, least) for part, begin in blocks]
+    if not all(map(len, parts)):
+        raise _no_window(tracks, blocks, params)
+    return parts, params.model_copy(update={"split_by": "scene" if by_scene else "time"})
+
+
+def _no_window(tracks: Tracks, blocks: Sequence[tuple[Tracks, Integers]], params: SetParameters) -> InputError:
+    """Return what to say if a split has no window, with the longest that all could have."""
+    together = f"{params.least_agents} agents together" if params.least_agents > 1 else "an agent without a gap"
+    scenes = np.sort(longest(tracks, params.least_agents))[::-1]
+    by_scene = int(scenes[len(SPLITS) - 1]) if len(scenes) >= len(SPLITS) else 0
+    by_time = min(int(longest(part, params.least_agents).max(initial=0)) for part, _ in blocks)
+    most = max(by_scene, by_time) - 1
+    if most >= params.window:
+        return InputError(
+            f"no window of {params.window} frames begins where --stride {params.stride} looks for it; lower --stride"
+        )
+    if most < 2:
+        return InputError(f"no three splits can have {together} for 3 frames; raise --fill-gaps, or add more scenes")
+    return InputError(
+        f"no three splits can have windows of {params.window} frames, and one before, with {together}; the longest "
+        f"possible is --window {most}"
+    )
+
+
+def _alike(parts: Sequence[Windows]) -> bool:
+    """Return whether all windows have the same agents."""
+    numbers = np.concatenate([part.agents for part in parts])
+    if (numbers != numbers[0]).any():
+        return False
+    names = np.concatenate([part.names for part in parts]).reshape(len(numbers), numbers[0])
+    return bool((names == names[0]).all())
+
+
+def _trajectories(part: Windows, agents: int, scene: Integers) -> Trajectories:
+    tracks = part.tracks
+    frame = tracks.first[part.scene] + (part.begin + 1) * tracks.step[part.scene]
+    return windows(part.positions(agents), part.agents, scene, frame)
+
+
+def _check_scaling(experts: ExpertSet, sources: Sequence[Path]) -> None:
+    label = quoted(sources[0], 80)
+    try:
+        _ = experts.scaling
+    except ValueError:
+        raise InputError(f"nothing moves in the training windows of {label}; is it the right column of each?") from None
+    if not experts.is_scalable:
+        raise InputError(f"the positions in {label} differ too much in size to be scaled alike; leave the largest out")

@@ -1,0 +1,280 @@
+"""Read CSV and Parquet, one row per agent and frame, in pieces."""
+
+import csv
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from ssmail.config.foreign_files import open_regular
+from ssmail.data.importing.rows import AXES, LARGEST_POSITION, Codes, RowCollector, SourceFile, quoted
+from ssmail.data.trajectories import Floats
+from ssmail.errors import InputError, shortened
+
+PIECE = 500_000  # rows that are read at once
+LONGEST_HEADER = 2**16  # bytes
+MOST_COLUMNS = 2000
+MISSING = ("", "nan", "na", "n/a", "null", "none")
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The names of the columns: None for the usual name (the field's), "" for none. Only x, frame and agent must be."""
+
+    scene: str | None = None
+    frame: str | None = None
+    agent: str | None = None
+    x: str | None = None
+    y: str | None = None
+    z: str | None = None
+
+    def among(self, header: list[str], label: str) -> dict[str, int]:
+        """Return field -> index of its column in the header, in the order of the file.
+
+        Raises InputError if a column is missing or not unique.
+        """
+        found: dict[str, int] = {}
+        for role in ("scene", "frame", "agent", *AXES):
+            name = getattr(self, role)
+            column = role if name is None else name
+            if column == "" and role not in ("x", "frame", "agent"):
+                continue
+            if column in header:
+                found[role] = header.index(column)
+                if header.count(column) > 1:
+                    raise InputError(f"{label} has several columns {quoted(column)!r}; rename one of them")
+            elif name is not None or role in ("x", "frame", "agent"):
+                there = shortened(", ".join(map(quoted, header)), 120)
+                raise InputError(
+                    f"{label} has no column {quoted(column)!r}, only {there}; name the one that it is with --{role}"
+                )
+        if "z" in found and "y" not in found:
+            raise InputError(f"{label} has no column for y beside z; name it with --y, or leave z out with --z ''")
+        if len(set(found.values())) < len(found):
+            raise InputError(f"{label} has one column for two of {', '.join(found)}; give each its own")
+        return dict(sorted(found.items(), key=lambda item: item[1]))
+
+
+def read_csv(file: SourceFile, columns: Columns, collector: RowCollector) -> None:
+    """Read a text file with a header line: values separated by commas, semicolons, tabs or spaces.
+
+    Raises InputError that names the file, and the line and column if it is one of them.
+    """
+    import pandas as pd
+
+    with open_regular(file.path) as opened:
+        header, separator = _header(opened, file.label)
+        places = columns.among(header, file.label)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of an empty column at the end of each line
+                for piece in _pieces(opened, places, len(header), separator):
+                    _add(piece, file, list(places), collector)
+        except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
+            raise _malformed(error, file.label) from None
+        except UnicodeDecodeError:
+            raise InputError(f"{file.label} is not UTF-8 text; save it with this encoding") from None
+        except (ValueError, OverflowError):
+            raise _first_fault(opened, file, header, places, separator) from None
+    collector.end(file, partial(_line, file.path, separator))
+
+
+def _header(opened: IO[bytes], label: str) -> tuple[list[str], str]:
+    """Return the names in the first line that is not empty, and what separates them."""
+    line = b"\n"
+    while line and not line.strip():
+        line = opened.readline(LONGEST_HEADER)
+    try:
+        text = line.decode("utf-8-sig").rstrip("\r\n")
+    except UnicodeDecodeError:
+        raise InputError(f"{label} is not UTF-8 text; save it with this encoding") from None
+    if not text or len(line) == LONGEST_HEADER or "\0" in text:
+        raise InputError(f"{label} has no header line with the names of columns; put one first, as frame,agent,x,y")
+    separator = max(",;\t", key=text.count)
+    if separator not in text:
+        separator = r"\s+"
+    names = (
+        text.split() if separator == r"\s+" else next(csv.reader([text], delimiter=separator, skipinitialspace=True))
+    )
+    names = [name.strip() for name in names]
+    if all(re.fullmatch(r"[-+.\deE]+", name) for name in names):
+        raise InputError(
+            f"{label}, line 1 has numbers instead of the names of columns; put a line first: frame,agent,x,y"
+        )
+    if len(names) > MOST_COLUMNS:
+        raise InputError(f"{label} has {len(names):,} columns; have one row per agent and frame")
+    return names, separator
+
+
+def _pieces(opened: IO[bytes], places: dict[str, int], width: int, separator: str, text: bool = False) -> Iterator[Any]:
+    """Read the columns in pieces of PIECE rows, numbers as such, or all as text."""
+    import pandas as pd
+
+    opened.seek(0)
+    whole = len(places) == width  # then pandas notices a line that has more values than the header
+    kinds: dict[str, Any] = {role: "category" if role in ("scene", "agent") else np.float64 for role in places}
+    return iter(
+        pd.read_csv(
+            opened,
+            sep=separator,
+            header=0,
+            names=list(places),
+            usecols=None if whole else list(places.values()),
+            index_col=False,
+            dtype=str if text else kinds,
+            na_filter=False,
+            skipinitialspace=True,
+            encoding="utf-8-sig",
+            chunksize=PIECE,
+        )
+    )
+
+
+def _add(piece: Any, file: SourceFile, roles: list[str], collector: RowCollector) -> None:
+    """Add a piece of a table. Raises ValueError if there is a number in it that cannot be."""
+    axes = [axis for axis in AXES if axis in roles]
+    positions: Floats = np.stack([piece[axis].to_numpy() for axis in axes], axis=-1)
+    frame: Floats = piece["frame"].to_numpy()
+    if not (np.abs(positions) <= LARGEST_POSITION).all() or not np.isfinite(frame).all():
+        raise ValueError
+    if not len(frame):
+        return
+    agent = _numbered(piece["agent"].cat, collector, file, "agents")
+    if "scene" in roles:
+        scene = _numbered(piece["scene"].cat, collector, file, "scenes")
+    else:
+        scene = np.full(len(frame), collector.scenes.number([file.scene], file.label)[0])
+    collector.add(file, scene, frame, agent, positions)
+
+
+def _numbered(category: Any, collector: RowCollector, file: SourceFile, what: str) -> Codes:
+    numbers: Codes = getattr(collector, what).number(category.categories, file.label)[category.codes]
+    return numbers
+
+
+def _malformed(error: Exception, label: str) -> InputError:
+    if found := re.search(r"Expected (\d+) fields in line (\d+), saw (\d+)", str(error)):
+        expected, line, saw = found.groups()
+        return InputError(f"{label}, line {line} has {saw} values instead of {expected}; correct the line")
+    if found := re.search(r"EOF inside string starting at row (\d+)", str(error)):
+        return InputError(f"{label} has a quotation mark that is not closed after row {found[1]}; close it")
+    return InputError(f"{label} cannot be read as CSV; save it again as CSV with a header line")
+
+
+def _first_fault(
+    opened: IO[bytes], file: SourceFile, header: list[str], places: dict[str, int], separator: str
+) -> InputError:
+    """Return what to say of the first number in the file that is none."""
+    import pandas as pd
+
+    before = 0
+    for piece in _pieces(opened, places, len(header), separator, text=True):
+        faults = []
+        for role in (role for role in places if role not in ("scene", "agent")):
+            numbers = pd.to_numeric(piece[role], errors="coerce").to_numpy(np.float64)
+            wrong = ~(np.abs(numbers) <= (LARGEST_POSITION if role in AXES else np.finfo(np.float64).max))
+            if wrong.any():
+                faults.append((int(wrong.argmax()), role))
+        if faults:
+            row, role = min(faults)
+            place = f"{file.label}, {_line(file.path, separator, before + row)}"
+            return unusable(piece[role].iloc[row], place, header[places[role]])
+        before += len(piece)
+    return InputError(f"{file.label} holds numbers that cannot be read; save it again as CSV")
+
+
+def unusable(value: object, place: str, column: str) -> InputError:
+    """Return what to say of a value that should be a number."""
+    text = str(value).strip()
+    if text.lower() in MISSING:
+        reason, remedy = "is empty or NaN", "leave the row out; --fill-gaps interpolates missing frames"
+    else:
+        reason = f"holds {quoted(text, 24)!r}, which is {'too large' if _is_number(text) else 'no number'}"
+        remedy = "correct it, or leave the row out"
+    return InputError(f"{place}: the column {quoted(column)!r} {reason}; {remedy}")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _line(path: Path, separator: str, row: int) -> str:
+    """Name the line of the n-th row below the header. Empty lines count as lines, but not as rows."""
+    with open_regular(path) as opened:
+        text = io.TextIOWrapper(opened, encoding="utf-8-sig", errors="replace", newline="")
+        lines = csv.reader(text, delimiter="\t" if separator == r"\s+" else separator)
+        try:
+            rows = (cells for cells in lines if len(cells) > 1 or "".join(cells).strip())
+            for count, _ in enumerate(rows, start=-1):
+                if count == row:
+                    return f"line {lines.line_num}"
+        except csv.Error:
+            pass
+    return f"row {row + 1}"
+
+
+def read_parquet(file: SourceFile, columns: Columns, collector: RowCollector) -> None:
+    """Read a Parquet file. Raises InputError that names the file, and the row and column if it is one of them."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise InputError(
+            f"{file.label} needs pyarrow to be read; install it with `pip install 'ssmail[parquet]'`, or save CSV"
+        ) from None
+
+    with open_regular(file.path) as opened, io.FileIO(opened.fileno(), closefd=False) as plain:
+        try:
+            table = pq.ParquetFile(io.BufferedReader(plain))
+            header = table.schema_arrow.names
+            places = columns.among(header, file.label)
+            before = 0
+            for batch in table.iter_batches(PIECE, columns=[header[place] for place in places.values()]):
+                arrays = dict(zip(places, (batch.column(header[place]) for place in places.values()), strict=True))
+                _add_arrow(arrays, file, before, {role: header[place] for role, place in places.items()}, collector)
+                before += len(batch)
+        except (pa.ArrowException, OSError, ValueError, MemoryError) as error:
+            raise InputError(
+                f"{file.label} cannot be read as Parquet ({quoted(error, 80)}); write the file again"
+            ) from None
+    collector.end(file, lambda row: f"row {row + 1}")
+
+
+def _add_arrow(
+    arrays: dict[str, Any], file: SourceFile, before: int, names: dict[str, str], collector: RowCollector
+) -> None:
+    """Add a batch of a Parquet file. before: the rows of the file before it. names: of the columns."""
+    import pandas as pd
+    import pyarrow as pa
+
+    columns: dict[str, Any] = {}
+    for role, array in arrays.items():
+        if role in ("scene", "agent"):
+            if array.null_count:
+                row = before + int(np.argmax(array.is_null()))
+                raise unusable("", f"{file.label}, row {row + 1}", names[role])
+            coded = array.cast(pa.string()).dictionary_encode()
+            columns[role] = pd.Categorical.from_codes(coded.indices.to_numpy(), coded.dictionary.to_pylist())
+            continue
+        if not (pa.types.is_integer(array.type) or pa.types.is_floating(array.type)):
+            raise InputError(
+                f"the column {quoted(names[role])!r} of {file.label} holds {quoted(array.type)} values, no numbers; "
+                "convert it to numbers"
+            )
+        numbers = array.to_numpy(zero_copy_only=False).astype(np.float64)
+        wrong = ~(np.abs(numbers) <= (LARGEST_POSITION if role in AXES else np.finfo(np.float64).max))
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise unusable(array[row].as_py() or "", f"{file.label}, row {before + row + 1}", names[role])
+        columns[role] = numbers
+    _add(pd.DataFrame(columns, copy=False), file, list(arrays), collector)
