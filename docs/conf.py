@@ -41,7 +41,9 @@ CONTENTS = """
 :caption: Use
 
 docs/usage
+docs/tutorial
 docs/reference/commands
+docs/adapters
 docs/extending
 docs/database
 ```
