@@ -8,13 +8,16 @@ from pettingzoo import ParallelEnv
 
 
 class BouncingBox(ParallelEnv):
-    """Observations are [velocity, position]; an action is an acceleration. One agent may leave early."""
+    """Observations are [velocity, position]; an action is an acceleration.
+
+    The first agent may leave at a step, and the last one may join at a step.
+    """
 
     metadata = {"name": "bouncing_box_v0"}  # noqa: RUF012 - as PettingZoo has it
 
-    def __init__(self, count: int = 3, steps: int = 30, leaves: int | None = None) -> None:
+    def __init__(self, count: int = 3, steps: int = 30, leaves: int | None = None, joins: int | None = None) -> None:
         self.possible_agents = [f"ball_{n}" for n in range(count)]
-        self.steps, self.leaves = steps, leaves
+        self.steps, self.leaves, self.joins = steps, leaves, joins
         self.spaces = {agent: Box(-np.inf, np.inf, (4,)) for agent in self.possible_agents}
         self.actions = {agent: Box(-0.1, 0.1, (2,)) for agent in self.possible_agents}
 
@@ -26,8 +29,8 @@ class BouncingBox(ParallelEnv):
 
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         draw = np.random.default_rng(seed)
-        self.agents, self.at = list(self.possible_agents), 0
-        self.velocity, self.position = draw.uniform(-0.1, 0.1, (2, len(self.agents), 2))
+        self.agents, self.at = self.possible_agents[: None if self.joins is None else -1], 0
+        self.velocity, self.position = draw.uniform(-0.1, 0.1, (2, len(self.possible_agents), 2))
         return self._observed(), {agent: {} for agent in self.agents}
 
     def step(self, actions: dict[str, Any]) -> tuple[dict, dict, dict, dict, dict]:
@@ -41,6 +44,9 @@ class BouncingBox(ParallelEnv):
         self.position = np.where(outside, np.sign(moved) * 2 - moved, moved)
         self.at += 1
         over = {agent: self.at >= self.steps or (n == 0 and self.at == self.leaves) for n, agent in enumerate(acting)}
+        if self.at == self.joins:
+            self.agents, over = list(self.possible_agents), over | {self.possible_agents[-1]: False}
+            acting = self.agents
         observed = self._observed()
         self.agents = [agent for agent in acting if not over[agent]]
         return observed, dict.fromkeys(acting, 0.0), dict.fromkeys(acting, False), over, {agent: {} for agent in acting}

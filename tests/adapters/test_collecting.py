@@ -52,8 +52,9 @@ def test_the_seed_decides_the_episodes_and_more_of_them_change_none() -> None:
     assert (collected(1, seed=1)[0] != collected(1, seed=2)[0]).any()
 
 
-def test_a_recording_ends_when_an_agent_leaves_or_after_so_many_steps() -> None:
-    assert len(collected(1, leaves=7)[0]) == 8
+def test_a_recording_ends_when_an_agent_leaves_or_joins_or_after_so_many_steps() -> None:
+    assert collected(1, leaves=7)[0].shape == (8, 3, 2)
+    assert collected(1, joins=7)[0].shape == (7, 2, 2)
     (episode,) = collect_episodes(BouncingBox(), home, positions, episodes=1, steps=4)
     assert len(episode) == 5
 

@@ -51,7 +51,7 @@ def _episode(
     frames = [_checked(positions(observations), number, 0)]
     while env.agents == agents and len(frames) <= steps:
         observations, *_ = env.step(policy(observations))
-        if not observations.keys() >= set(agents):
+        if not set(env.agents) <= set(agents) <= observations.keys():
             break
         frame = _checked(positions(observations), number, len(frames))
         if frame.shape != frames[0].shape:
