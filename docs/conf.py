@@ -42,6 +42,7 @@ CONTENTS = """
 
 docs/usage
 docs/tutorial
+docs/data-format
 docs/reference/commands
 docs/adapters
 docs/extending

@@ -150,7 +150,8 @@ def _print_summary(experts: "ExpertSet", summary: "Summary", out: Path, as_json:
         )
         unit = "second" if experts.parameters["dt"] else "step"
         speeds = ", ".join(f"{name} {value:.4g}" for name, value in summary.speeds.items())
-        say(f"read {summary.rows:,} rows of {summary.scenes:,} scenes from {summary.files:,} files")
+        files = "1 file" if summary.files == 1 else f"{summary.files:,} files"
+        say(f"read {summary.rows:,} rows of {summary.scenes:,} scenes from {files}")
         say(f"speeds in units per {unit}: {speeds}")
         for what, count in summary.left_out.items():
             if count:

@@ -35,6 +35,7 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "generate-yjunction",
         "generate-letters",
         "prep-mocap",
+        "import-data",
         "train",
         "ablate",
         "ablate-alpha",

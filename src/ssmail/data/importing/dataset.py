@@ -62,7 +62,7 @@ class ImportOptions:
 def import_set(
     sources: Sequence[Path], options: ImportOptions, report: Callable[[str], None] = lambda _: None
 ) -> tuple[ExpertSet, Summary]:
-    """Make an expert set from files, or from all those in folders. report: is told which file is being read.
+    """Make an expert set from files, or from all those in folders. report: is told of large files.
 
     Raises InputError for anything in the files that cannot be used, and if there is no window for each split.
     """
@@ -95,7 +95,7 @@ def _parts(tracks: Tracks, rows: Rows, params: SetParameters) -> tuple[list[Wind
     found = np.bincount(cut(tracks, start, frames, stride, least).scene, minlength=len(start))
     by_scene = np.count_nonzero(found) >= len(SPLITS)
     if by_scene:
-        split = split_scenes(rows.scenes, found, params.split)
+        split = np.maximum(split_scenes(rows.scenes, found, params.split), 0)  # of scenes without windows, any
         blocks = [(tracks[split[tracks.scene] == number], start) for number in range(len(SPLITS))]
     else:
         blocks = split_times(tracks, len(start), params.split)

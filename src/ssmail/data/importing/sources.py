@@ -1,6 +1,7 @@
 """The files to import, and what reads each."""
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -8,9 +9,10 @@ from ssmail.config.foreign_files import IrregularFileError, open_regular
 from ssmail.data.importing.arrays import read_array
 from ssmail.data.importing.rows import RowCollector, Rows, SourceFile, quoted
 from ssmail.data.importing.tables import Columns, read_csv, read_parquet
-from ssmail.errors import InputError
+from ssmail.errors import InputError, printable
 
 MOST_FILES = 10_000
+LARGE = 5 * 10**7  # bytes; reading such a file takes seconds, and is reported
 TABLES = {".csv": read_csv, ".tsv": read_csv, ".txt": read_csv, ".parquet": read_parquet}
 ARRAYS = (".npy", ".npz")
 SUFFIXES = (*TABLES, *ARRAYS)
@@ -54,13 +56,12 @@ def read_files(
     Raises InputError that names the file, and the line and column if it is one of them.
     """
     collector, digests = RowCollector(), {}
-    for number, file in enumerate(files, start=1):
-        report(f"reading {file.label} ({number} of {len(files)})")
+    for file in files:
         try:
             with open_regular(file.path) as opened:
-                digests[file.path.name if len(files) == 1 else file.path.as_posix()] = hashlib.file_digest(
-                    opened, "sha256"
-                ).hexdigest()
+                if (size := os.fstat(opened.fileno()).st_size) >= LARGE:
+                    report(f"reading {file.label}, {size / 1e6:,.0f} MB")
+                digests[printable(file.path.as_posix())] = hashlib.file_digest(opened, "sha256").hexdigest()
             suffix = file.path.suffix.lower()
             if suffix in TABLES:
                 TABLES[suffix](file, columns, collector)

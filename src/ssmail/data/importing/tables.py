@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssmail.config.foreign_files import open_regular
 from ssmail.data.importing.rows import AXES, LARGEST_POSITION, Codes, RowCollector, SourceFile, quoted
@@ -20,6 +21,7 @@ from ssmail.errors import InputError, shortened
 PIECE = 500_000  # rows that are read at once
 LONGEST_HEADER = 2**16  # bytes
 MOST_COLUMNS = 2000
+LARGEST_NUMBER = 1e18  # of a frame or time
 MISSING = ("", "nan", "na", "n/a", "null", "none")
 
 
@@ -81,7 +83,7 @@ def read_csv(file: SourceFile, columns: Columns, collector: RowCollector) -> Non
         except UnicodeDecodeError:
             raise InputError(f"{file.label} is not UTF-8 text; save it with this encoding") from None
         except (ValueError, OverflowError):
-            raise _first_fault(opened, file, header, places, separator) from None
+            raise _first_fault(file, header, places, separator) from None
     collector.end(file, partial(_line, file.path, separator))
 
 
@@ -141,7 +143,7 @@ def _add(piece: Any, file: SourceFile, roles: list[str], collector: RowCollector
     axes = [axis for axis in AXES if axis in roles]
     positions: Floats = np.stack([piece[axis].to_numpy() for axis in axes], axis=-1)
     frame: Floats = piece["frame"].to_numpy()
-    if not (np.abs(positions) <= LARGEST_POSITION).all() or not np.isfinite(frame).all():
+    if not _usable(positions, "x").all() or not _usable(frame, "frame").all():
         raise ValueError
     if not len(frame):
         return
@@ -167,26 +169,30 @@ def _malformed(error: Exception, label: str) -> InputError:
     return InputError(f"{label} cannot be read as CSV; save it again as CSV with a header line")
 
 
-def _first_fault(
-    opened: IO[bytes], file: SourceFile, header: list[str], places: dict[str, int], separator: str
-) -> InputError:
+def _first_fault(file: SourceFile, header: list[str], places: dict[str, int], separator: str) -> InputError:
     """Return what to say of the first number in the file that is none."""
     import pandas as pd
 
     before = 0
-    for piece in _pieces(opened, places, len(header), separator, text=True):
-        faults = []
-        for role in (role for role in places if role not in ("scene", "agent")):
-            numbers = pd.to_numeric(piece[role], errors="coerce").to_numpy(np.float64)
-            wrong = ~(np.abs(numbers) <= (LARGEST_POSITION if role in AXES else np.finfo(np.float64).max))
-            if wrong.any():
-                faults.append((int(wrong.argmax()), role))
-        if faults:
-            row, role = min(faults)
-            place = f"{file.label}, {_line(file.path, separator, before + row)}"
-            return unusable(piece[role].iloc[row], place, header[places[role]])
-        before += len(piece)
+    with open_regular(file.path) as opened:
+        for piece in _pieces(opened, places, len(header), separator, text=True):
+            faults = []
+            for role in (role for role in places if role not in ("scene", "agent")):
+                wrong = ~_usable(pd.to_numeric(piece[role], errors="coerce").to_numpy(np.float64), role)
+                if wrong.any():
+                    faults.append((int(wrong.argmax()), role))
+            if faults:
+                row, role = min(faults)
+                place = f"{file.label}, {_line(file.path, separator, before + row)}"
+                return unusable(piece[role].iloc[row], place, header[places[role]])
+            before += len(piece)
     return InputError(f"{file.label} holds numbers that cannot be read; save it again as CSV")
+
+
+def _usable(numbers: Floats, role: str) -> NDArray[np.bool_]:
+    """Return which numbers of a column are finite and not too large."""
+    usable: NDArray[np.bool_] = np.abs(numbers) <= (LARGEST_POSITION if role in AXES else LARGEST_NUMBER)
+    return usable
 
 
 def unusable(value: object, place: str, column: str) -> InputError:
@@ -272,7 +278,7 @@ def _add_arrow(
                 "convert it to numbers"
             )
         numbers = array.to_numpy(zero_copy_only=False).astype(np.float64)
-        wrong = ~(np.abs(numbers) <= (LARGEST_POSITION if role in AXES else np.finfo(np.float64).max))
+        wrong = ~_usable(numbers, role)
         if wrong.any():
             row = int(wrong.argmax())
             raise unusable(array[row].as_py() or "", f"{file.label}, row {before + row + 1}", names[role])
