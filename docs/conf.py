@@ -41,8 +41,10 @@ CONTENTS = """
 :caption: Use
 
 docs/usage
+docs/tutorial
 docs/data-format
 docs/reference/commands
+docs/adapters
 docs/extending
 docs/database
 ```

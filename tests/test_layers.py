@@ -11,7 +11,7 @@ FLOORS = (
     ("errors",),
     ("config",),
     ("data", "envs", "models"),
-    ("losses", "evaluation"),
+    ("losses", "evaluation", "adapters"),
     ("training",),
     ("store",),
     ("execution",),

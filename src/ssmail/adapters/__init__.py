@@ -1,0 +1,1 @@
+"""Neighbours: ssmail's environments for PettingZoo, and expert sets from PettingZoo and `imitation`."""
