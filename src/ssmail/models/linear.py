@@ -23,20 +23,21 @@ class BatchedProduct(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Multiply."""
         ctx.save_for_backward(x, weight)
-        ctx.has_bias = bias is not None
         return torch.bmm(x, weight.mT) if bias is None else torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor | None]:
-        """Return the gradients of x, W and b."""
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Return the gradients of x, W and b, those that are needed."""
         x, weight = ctx.saved_tensors
-        grad_x = None
-        if ctx.needs_input_grad[0]:
+        needs_x, needs_weight, needs_bias = ctx.needs_input_grad
+        grad_x = grad_weight = None
+        if needs_x:
             few = weight.shape[2] < 16
             grad_x = torch.bmm(weight.mT, gradient.mT.contiguous()).mT if few else torch.bmm(gradient, weight)
-        wide = weight.shape[1] < weight.shape[2]
-        grad_weight = torch.bmm(gradient.mT, x) if wide else torch.bmm(x.mT, gradient).mT
-        return grad_x, grad_weight, gradient.sum(dim=1) if ctx.has_bias else None
+        if needs_weight:
+            wide = weight.shape[1] < weight.shape[2]
+            grad_weight = torch.bmm(gradient.mT, x) if wide else torch.bmm(x.mT, gradient).mT
+        return grad_x, grad_weight, gradient.sum(dim=1) if needs_bias else None
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
