@@ -11,11 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+FEW = 16  # columns
+
 
 class BatchedProduct(torch.autograd.Function):
     """x W^T + b for S layers: x (S, M, D), W (S, H, D) and b (S, H) or None -> (S, M, H). Differentiable twice.
 
-    For wide batches M, a product with a few columns takes several times as long as its transpose, so the gradients are
+    For wide batches M, a product with FEW columns takes several times as long as its transpose, so the gradients are
     written to have few rows instead.
     """
 
@@ -23,20 +25,21 @@ class BatchedProduct(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:
         """Multiply."""
         ctx.save_for_backward(x, weight)
-        ctx.has_bias = bias is not None
         return torch.bmm(x, weight.mT) if bias is None else torch.baddbmm(bias.unsqueeze(1), x, weight.mT)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor, Tensor | None]:
-        """Return the gradients of x, W and b."""
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, Tensor | None]:
+        """Return the gradients of x, W and b, those that are needed."""
         x, weight = ctx.saved_tensors
-        grad_x = None
-        if ctx.needs_input_grad[0]:
-            few = weight.shape[2] < 16
-            grad_x = torch.bmm(weight.mT, gradient.mT.contiguous()).mT if few else torch.bmm(gradient, weight)
-        wide = weight.shape[1] < weight.shape[2]
-        grad_weight = torch.bmm(gradient.mT, x) if wide else torch.bmm(x.mT, gradient).mT
-        return grad_x, grad_weight, gradient.sum(dim=1) if ctx.has_bias else None
+        needs_x, needs_weight, needs_bias = ctx.needs_input_grad
+        grad_x = grad_weight = None
+        if needs_x:
+            few = weight.shape[2] < FEW
+            grad_x = torch.bmm(weight.mT, gradient.mT).mT if few else torch.bmm(gradient, weight)
+        if needs_weight:
+            few = weight.shape[1] < min(FEW, weight.shape[2])
+            grad_weight = torch.bmm(gradient.mT, x) if few else torch.bmm(x.mT, gradient).mT
+        return grad_x, grad_weight, gradient.sum(dim=1) if needs_bias else None
 
 
 def affine(x: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:

@@ -21,7 +21,7 @@ from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import entries, fitted, load_part
 from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import Generators, GeneratorsOfSeeds, drawn, normal_like
-from ssmail.training.stacking import Block, StackedAdam, stacked_modules
+from ssmail.training.stacking import Block, StackedAdam, fixed, stacked_modules
 
 Reward = Callable[[Tensor, Tensor], Tensor]
 """Maps features (S, B, C, N, F) and actions as read (S, B, C, N, A) to rewards (S, B, C, N)."""
@@ -108,6 +108,7 @@ class SoftActorCritic:
         self.policy, policy = stacked_modules([seed.policy for seed in seeds])
         self.critic, critic = stacked_modules([seed.critic for seed in seeds])
         self.target_critic, target = stacked_modules([seed.target_critic for seed in seeds])
+        self.fixed_critic = fixed(self.critic)
         temperature = Block([[seed.log_temperature] for seed in seeds])
         self.log_temperature = nn.Parameter(temperature.parts[0])
         learned: dict[str, tuple[Iterable[nn.Parameter], Block]] = {
@@ -255,7 +256,7 @@ class SoftActorCritic:
             others = at_steps(at.histories, now)[..., size:]
             read, graph = torch.cat([self.features.normalize_states(states), others], dim=-1), at_steps(at.graphs, now)
             action, log_prob = self._sample(read, graph, states[..., size // 2 :])
-        q = self.critic(read, self.features.normalize_actions(action), graph.detach())
+        q = self.fixed_critic(read, self.features.normalize_actions(action), graph.detach())
         tail = actor_loss(q, log_prob, temperature)
         return self.spec.gamma**self.spec.expansion_steps * tail - earlier.mean(dim=PER_SEED), first_log_prob
 

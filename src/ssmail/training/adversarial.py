@@ -37,7 +37,7 @@ from ssmail.training.learner import LearnerContext
 from ssmail.training.optimization import LearningRateSchedule, add_noise
 from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import GeneratorsOfSeeds, drawn
-from ssmail.training.stacking import StackedAdam, stacked_modules
+from ssmail.training.stacking import StackedAdam, fixed, stacked_modules
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,7 @@ class AdversarialTraining:
         self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
         self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
         self.discriminator, block = stacked_modules([seed.discriminator for seed in seeds])
+        self.fixed_discriminator = fixed(self.discriminator)
         self.optimizer = StackedAdam(
             list(self.discriminator.parameters()),
             block,
@@ -285,7 +286,7 @@ class AdversarialTraining:
 
     def reward(self, x: Tensor, actions: Tensor) -> Tensor:
         """Return the rewards (S, B, T, N) of features x (S, B, T, N, F) and actions (S, B, T, N, A)."""
-        return scaled_reward(self.adversarial, self.objective.reward(self.discriminator(x, actions)))
+        return scaled_reward(self.adversarial, self.objective.reward(self.fixed_discriminator(x, actions)))
 
     def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
         """Return the expert trajectory with which to mix each generated one."""

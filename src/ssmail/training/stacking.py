@@ -45,6 +45,17 @@ def stacked_modules(modules: Sequence[Module]) -> tuple[Module, Block]:
     return made, block
 
 
+def fixed(module: Module) -> Module:
+    """Return the same network with the same weights, in the same memory, for losses that it takes no gradient from.
+
+    autograd.grad leaves out what leads to no parameter that it is asked for, but not inside of hand-written gradients.
+    """
+    made = deepcopy(module)
+    for own, shared in zip(made.parameters(), module.parameters(), strict=True):
+        own.data = shared.data
+    return made.requires_grad_(False)
+
+
 class StackedAdam:
     """Adam on the weights of S seeds, which share a learning rate.
 
