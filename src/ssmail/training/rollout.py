@@ -46,9 +46,17 @@ class PolicyPredictor:
     def create(cls, spec: ModelSpec, experts: Batch, integrator: Integrator) -> "PolicyPredictor":
         """Make a policy with initial weights from torch's global generator, sized and normalized for `experts`."""
         features = Features.of(spec, experts.states)
+        made = cls.untrained(spec, features, experts.states.shape[-1], integrator)
+        made.model.to(experts.states.device)
+        return made
+
+    @classmethod
+    def untrained(
+        cls, spec: ModelSpec, features: Features, state_size: int, integrator: Integrator
+    ) -> "PolicyPredictor":
+        """Make a policy with initial weights from torch's global generator that reads these features."""
         bounds = ActionBounds.of(spec, features.normalization)
-        size, action_size = features.size(experts.states.shape[-1]), experts.actions.shape[-1]
-        policy = GraphPolicy(size, action_size, spec, bounds).to(experts.states.device)
+        policy = GraphPolicy(features.size(state_size), state_size // 2, spec, bounds)
         return cls(policy, features, integrator)
 
     @torch.no_grad()

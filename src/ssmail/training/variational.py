@@ -139,6 +139,11 @@ class VariationalPredictor:
     model: VariationalModel
     integrator: Integrator
 
+    @property
+    def features(self) -> Features:
+        """See Predictor."""
+        return self.model.features
+
     @torch.no_grad()
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor.
