@@ -23,7 +23,7 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import a public name when it is used for the first time: `import ssmail` itself loads neither torch nor pandas."""
+    """Import a public name when it is first used, so that `import ssmail` loads neither torch nor pandas."""
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(_PLACES[name]), name)

@@ -36,14 +36,16 @@ IDENTITY = Scaling(-1.0, 1.0, -1.0, 1.0)
 class TrainedRun:
     """The trained model of a stored run.
 
-    id, seed, dataset_hash: of the run. spec: its settings, with what the data decided. metrics: the last value of each
-    metric by its stored name; "test/..." is measured with the best model, "test_last/..." with the last one.
+    id, spec_hash, seed, dataset_hash: of the run. spec: its settings, with what the data decided.
+    metrics: the last value of each metric by its stored name; "test/..." is measured with the best model,
+    "test_last/..." with the last one.
     model, epoch: which model this is, and the epoch after which it was kept.
     scaling: between raw units and the [-1, 1] in which `predictor` works.
     axes, agents: the numbers P of axes and N of agents that the model can predict; None if any.
     """
 
     id: str
+    spec_hash: str
     seed: int
     dataset_hash: str | None = field(repr=False)
     spec: RunSpec = field(repr=False)
@@ -172,6 +174,7 @@ def load_from(store: Store, run: str, *, model: Model = "best", data: str | Path
     baseline = described.features is None
     return TrainedRun(
         id=row.id,
+        spec_hash=row.spec_hash,
         seed=row.seed,
         dataset_hash=row.dataset_hash,
         spec=described.spec,
