@@ -41,6 +41,7 @@ CONTENTS = """
 :caption: Use
 
 docs/usage
+docs/python
 docs/reference/commands
 docs/extending
 docs/database

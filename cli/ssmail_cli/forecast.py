@@ -70,7 +70,7 @@ def forecast(
         return
     which = f"run {trained.id[:8]} ({trained.spec.method}, {trained.model} model, of epoch {trained.epoch})"
     say(f"wrote {out}: {w} windows, {samples} samples of {t} steps each, by {which}")
-    if found.positions.shape[1] and trained.predictor.features is None and samples > 1:
+    if trained.predictor.features is None and samples > 1:
         note(f"{trained.spec.method} has no randomness: the samples of a window are all alike")
 
 

@@ -53,12 +53,15 @@ class Forecast:
 def forecast(run: TrainedRun, windows: Windows, steps: int | None, samples: int, seed: int) -> Forecast:
     """Sample the futures of all windows, those with the same number of agents together (`TrainedRun.rollout`).
 
-    steps: by default as many as in the test of the run. Raises InputError if nothing tells how many.
+    steps: by default as many as in the test of the run, as far as it can predict. Raises InputError if nothing tells
+    how many.
     """
-    count = steps or windows.steps or run.predicted
+    w, frames, n, axes = windows.positions.shape
+    count, most = steps or windows.steps or run.predicted, run.most_steps(frames)
     if count is None:
         raise InputError("nothing tells how many steps to predict; give --steps.")
-    w, _, n, axes = windows.positions.shape
+    if steps is None and most is not None:
+        count = max(min(count, most), 1)
     futures = np.full((samples, w, count, n, axes), np.nan)
     for number in np.unique(windows.agents):
         chosen = np.flatnonzero(windows.agents == number)
@@ -95,8 +98,7 @@ def write(found: Forecast, path: Path, *, force: bool = False) -> int:
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}; choose a writable --out") from error
     samples, _, steps, *_ = found.positions.shape
-    rows: int = found.agents.sum() * samples * steps
-    return int(rows)
+    return sum(found.agents.tolist()) * samples * steps
 
 
 def _write_csv(found: Forecast, path: Path) -> None:

@@ -75,6 +75,14 @@ class TrainedRun:
         generated = self.spec.data.letters or self.spec.data.yjunction
         return None if generated is None or self.spec.data.path else generated.steps - 1
 
+    def most_steps(self, frames: int) -> int | None:
+        """Return how many steps can be predicted after so many observed frames; None if any number.
+
+        A model that reads the step index (model.time_input) knows only those that it was trained on.
+        """
+        features = self.predictor.features
+        return features.steps + 1 - frames if features is not None and features.time else None
+
     def rollout(self, observed: npt.ArrayLike, steps: int, samples: int = 1, seed: int = 0) -> Floats:
         """Sample what the agents do next.
 
@@ -114,11 +122,10 @@ class TrainedRun:
             raise InputError("the observed positions hold NaN or infinite values; leave these windows out.")
         if steps < 1 or samples < 1:
             raise InputError(f"steps and samples are at least 1, not {steps} and {samples}.")
-        features = self.predictor.features
-        if features is not None and features.time and frames - 2 + steps >= features.steps:
-            most = features.steps + 1 - frames
-            remedy = f"ask for at most {most} steps" if most > 0 else f"observe at most {features.steps} frames"
-            raise InputError(f"the model reads the step index and was trained on {features.steps} states; {remedy}.")
+        most = self.most_steps(frames)
+        if most is not None and steps > most:
+            remedy = f"ask for at most {most} steps" if most > 0 else f"observe at most {frames + most - 1} frames"
+            raise InputError(f"the model reads the step index, of which it was trained on so many; {remedy}.")
 
     def _states(self, observed: Floats) -> torch.Tensor:
         """Return the scaled states (B, T - 1, N, 2P) of positions (B, T, N, P)."""
