@@ -9,7 +9,7 @@ import pytest
 
 from ssmail.config.experiments import build_spec
 from ssmail.execution import Resume
-from ssmail.execution.cells import Cell, RunSettings
+from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.store import Store
 from ssmail.training.loop import TrainingLoop
 from tests.data.mocap.handmade import write_set
@@ -49,8 +49,11 @@ def train(tmp_path_factory: pytest.TempPathFactory) -> Train:
             loops.append(TrainingLoop(*arguments))  # type: ignore[arg-type]
             return loops[0]
 
+        ignored: list[Event] = []
         store = Store.open(db)
-        event = run_cell(Cell(spec, 0), store, RunSettings("cpu", Resume.NEVER), print, lambda: False, make_loop)
+        event = run_cell(
+            Cell(spec, 0), store, RunSettings("cpu", Resume.NEVER), ignored.append, lambda: False, make_loop
+        )
         store.close()
         assert event.kind == "finished", event.message
         assert event.run_id is not None

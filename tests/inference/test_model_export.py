@@ -85,8 +85,8 @@ def test_steps_with_the_same_noise_are_a_rollout(train: Train, given: tuple[str,
     calls = {name: module(program) for name, program in programs.items()}
     assert distance(run, programs, calls, observed) < CLOSE
 
-    def deaf(inputs: dict[str, Tensor]) -> list[Tensor]:  # negative control: the memory matters
-        forgotten = ("hidden", "cell", "memory", "graph", "action_noise")
+    def deaf(inputs: dict[str, Tensor]) -> list[Tensor]:  # negative control: noise and memory matter
+        forgotten = ("hidden", "cell", "memory", "graph", "graph_noise", "action_noise")
         return calls["step"]({k: v * 0 if k in forgotten else v for k, v in inputs.items()})
 
     assert distance(run, programs, calls | {"step": deaf}, observed) > CLOSE
