@@ -138,6 +138,7 @@ def test_what_cannot_be_forecast_is_one_sentence(
         (["--observed", "1", "--out", str(out)], "2 to 4 of them can be observed, not 1"),
         (["--out", str(tmp_path / "futures.xlsx")], "unknown ending of --out '.xlsx'"),
         (["--model", "worst", "--out", str(out)], "--model is best or last"),
+        (["--samples", "10000", "--steps", "100000", "--out", str(out)], "do not fit into memory"),
     ):
         assert command([*arguments, *more]) == 2
         assert said in capsys.readouterr().err

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 FORMATS = (".csv", ".parquet", ".npz")
 AXES = ("x", "y", "z")
 ROWS = 10**6  # of a piece of the table that is written at once
+MOST_NUMBERS = 5 * 10**8  # in a forecast; 4 GB
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ def forecast(run: TrainedRun, windows: Windows, steps: int | None, samples: int,
     """Sample the futures of all windows, those with the same number of agents together (`TrainedRun.rollout`).
 
     steps: by default as many as in the test of the run, as far as it can predict. Raises InputError if nothing tells
-    how many.
+    how many, or if the forecast would be too large.
     """
     w, frames, n, axes = windows.positions.shape
     count, most = steps or windows.steps or run.predicted, run.most_steps(frames)
@@ -62,6 +63,11 @@ def forecast(run: TrainedRun, windows: Windows, steps: int | None, samples: int,
         raise InputError("nothing tells how many steps to predict; give --steps.")
     if steps is None and most is not None:
         count = max(min(count, most), 1)
+    if samples * w * count * n * axes > MOST_NUMBERS:
+        raise InputError(
+            f"{samples} samples of {w} windows, {count} steps and {n} agents do not fit into memory; lower --samples or "
+            "--steps, or give fewer windows."
+        )
     futures = np.full((samples, w, count, n, axes), np.nan)
     for number in np.unique(windows.agents):
         chosen = np.flatnonzero(windows.agents == number)

@@ -140,8 +140,8 @@ class TrainedRun:
     def _sample(self, states: torch.Tensor, steps: int, samples: int, seed: int) -> Floats:
         """Return raw positions (S, B, T', N, P) that follow the states (B, H, N, 2P)."""
         generator = torch.Generator().manual_seed(seed)
-        groups = torch.split(states.repeat(samples, 1, 1, 1), TOGETHER)
-        made = [self.predictor.free_run(group, steps, generator)[:, 1:] for group in groups]
+        groups = torch.split(torch.arange(len(states)).repeat(samples), TOGETHER)
+        made = [self.predictor.free_run(states[group], steps, generator)[:, 1:] for group in groups]
         scaled = to_numpy(torch.cat(made))[..., : states.shape[-1] // 2]
         positions: Floats = self.scaling.unscale_positions(scaled)
         return positions.reshape(samples, len(states), *positions.shape[1:])
