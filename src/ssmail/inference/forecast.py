@@ -65,8 +65,8 @@ def forecast(run: TrainedRun, windows: Windows, steps: int | None, samples: int,
         count = max(min(count, most), 1)
     if samples * w * count * n * axes > MOST_NUMBERS:
         raise InputError(
-            f"{samples} samples of {w} windows, {count} steps and {n} agents do not fit into memory; lower --samples or "
-            "--steps, or give fewer windows."
+            f"{samples} samples of {w} windows, {count} steps and {n} agents do not fit into memory; lower --samples "
+            "or --steps, or give fewer windows."
         )
     futures = np.full((samples, w, count, n, axes), np.nan)
     for number in np.unique(windows.agents):
@@ -104,7 +104,8 @@ def write(found: Forecast, path: Path, *, force: bool = False) -> int:
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}; choose a writable --out") from error
     samples, _, steps, *_ = found.positions.shape
-    return sum(found.agents.tolist()) * samples * steps
+    rows: int = sum(found.agents.tolist()) * samples * steps
+    return rows
 
 
 def _write_csv(found: Forecast, path: Path) -> None:

@@ -37,12 +37,12 @@ def to_tensorboard(store: Store, runs: Sequence[RunRow], folder: Path) -> None:
             raise InputError(f"{target} exists already; choose another --out, or remove it")
     for row in runs:
         try:
-            with SummaryWriter(str(targets[row.id])) as writer:  # type: ignore[no-untyped-call]  # torch's
+            with SummaryWriter(str(targets[row.id])) as writer:
                 began = row.started.timestamp()
                 spec = json.dumps(row.spec, indent=2)
-                writer.add_text("spec", f"```json\n{spec}\n```", walltime=began)  # type: ignore[no-untyped-call]
+                writer.add_text("spec", f"```json\n{spec}\n```", walltime=began)
                 for name, step, value in _metrics(store, row):
-                    writer.add_scalar(name, value, step, walltime=began + step)  # type: ignore[no-untyped-call]
+                    writer.add_scalar(name, value, step, walltime=began + step)
         except OSError as error:
             raise _unwritable(folder, error) from error
 
