@@ -16,7 +16,7 @@ import torch
 
 from ssmail import __version__
 from ssmail.data.atomic_file import atomic_write
-from ssmail.errors import InputError, missing_package, printable
+from ssmail.errors import InputError, missing_package
 from ssmail.inference.step_programs import Program, step_programs
 from ssmail.inference.trained_run import TrainedRun
 from ssmail.models import message_passing
@@ -164,8 +164,9 @@ def _card(
     return environment.get_template("model_card.md.j2").render(
         run=run,
         version=__version__,
-        spec_hash=run.spec_hash,
-        profile=re.sub(r"[^\w.-]", "?", printable(run.spec.profile))[:40],
+        spec_hash=_word(run.spec_hash),
+        data_sha256=_word(run.dataset_hash or "unknown"),
+        profile=_word(run.spec.profile),
         format=FORMAT,
         programs=programs,
         agents=programs["step"].inputs["positions"].shape[1],
@@ -174,6 +175,11 @@ def _card(
         steps=run.predicted,
         metrics=metrics,
     )
+
+
+def _word(text: str) -> str:
+    """Return a text of the database as a word that Markdown shows as it is."""
+    return re.sub(r"[^\w-]", "?", text, flags=re.ASCII)[:64]
 
 
 def _json(value: Any) -> bytes:
