@@ -43,6 +43,7 @@ CONTENTS = """
 docs/usage
 docs/tutorial
 docs/data-format
+docs/python
 docs/reference/commands
 docs/adapters
 docs/extending

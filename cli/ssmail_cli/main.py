@@ -10,7 +10,7 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError, shortened
-from ssmail_cli import claims, datasets, db, explain, import_data, plot, report, reproduce, runs, train
+from ssmail_cli import claims, datasets, db, explain, forecast, import_data, plot, report, reproduce, runs, train
 from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, print_remarks, say
 
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
@@ -35,6 +35,8 @@ app.command("reproduce")(reproduce.reproduce)
 app.command("report")(report.report)
 app.command("claims")(claims.claims)
 app.command("explain")(explain.explain)
+app.command("forecast")(forecast.forecast)
+app.command("export-model")(forecast.export_model)
 app.add_typer(plot.app, name="plot")
 app.add_typer(runs.app, name="runs")
 app.add_typer(db.app, name="db")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, printable
+from ssmail.errors import ExitCode, InputError, printable, unknown_name
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
 from ssmail_cli.output import (
@@ -145,7 +145,11 @@ def compare(
 def export(
     ids: options.RunIds = None,
     out: Annotated[
-        Path | None, typer.Option("--out", help="The file to write, replacing it.", show_default="stdout")
+        Path | None,
+        typer.Option("--out", help="The file to write, replacing it; with --to the folder.", show_default="stdout"),
+    ] = None,
+    to: Annotated[
+        str | None, typer.Option("--to", help="Write for tensorboard or mlflow, into the folder --out.")
     ] = None,
     method: options.Method = None,
     environment: options.Environment = None,
@@ -158,7 +162,14 @@ def export(
     ] = Format.CSV,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Export every metric of every epoch."""
+    """Export every metric of every epoch.
+
+    With --to, writes the metrics and the spec of each run for `tensorboard --logdir DIR` or `mlflow ui
+    --backend-store-uri DIR`.
+    """
+    if to is not None:
+        _export_to(to, out, options.open_store(db), (ids, method, environment, profile, state, figure))
+        return
     if form is Format.TABLE:
         raise InputError("an export is csv or json, not a table; `ssmail runs list` prints tables.")
     store = options.open_store(db)
@@ -197,6 +208,18 @@ def delete(
             raise typer.Exit(ExitCode.FAILURE)
     store.delete(full)
     note(f"deleted {names}")
+
+
+def _export_to(tool: str, out: Path | None, store: "Store", selection: Any) -> None:
+    from ssmail.store.tracking import TOOLS
+
+    if tool not in TOOLS:
+        raise unknown_name("tool", tool, TOOLS)
+    if out is None:
+        raise InputError(f"--to {tool} writes a folder; name it with --out.")
+    runs = options.select_runs(store, *selection)
+    TOOLS[tool](store, runs, out)
+    note(f"exported {counted(len(runs), 'run')} to {out}")
 
 
 def _values(metrics: "DataFrame") -> list[dict[Any, Any]]:

@@ -133,3 +133,10 @@ def suggestion(name: str, choices: Iterable[str]) -> str:
 def unknown_name(kind: str, name: str, choices: Iterable[str]) -> InputError:
     """An InputError for a misspelt name, with a suggestion from `choices`."""
     return InputError(f"unknown {kind} '{shortened(name, _NAME)}'; {suggestion(name, choices)}")
+
+
+def missing_package(error: ImportError, extra: str) -> InputError:
+    """An InputError for an optional package that is not installed; `extra` of ssmail brings it."""
+    return InputError(
+        f"the package {error.name or 'of this extra'} is not installed; run `pip install 'ssmail[{extra}]'`"
+    )

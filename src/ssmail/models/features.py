@@ -91,10 +91,14 @@ class Features:
 
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
         """Map states (..., T, N, D) from step `first_step` on, and start (..., N, D), to features (..., T, N, F)."""
+        steps = torch.arange(first_step, first_step + states.shape[-3], dtype=states.dtype, device=states.device)
+        return self.at(steps, states, start)
+
+    def at(self, steps: Tensor, states: Tensor, start: Tensor) -> Tensor:
+        """Map states (..., T, N, D) at the steps (T,), and start (..., N, D), to features (..., T, N, F)."""
         *lead, t, n, _ = states.shape
         parts = [self.normalize_states(states)]
         if self.time:
-            steps = torch.arange(first_step, first_step + t, dtype=states.dtype, device=states.device)
             scaled = 2 * steps / (self.steps - 1) - 1
             parts.append(scaled.view(t, 1, 1).expand(*lead, t, n, 1))
         if self.start:

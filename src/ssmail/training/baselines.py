@@ -16,6 +16,7 @@ class Baseline:
     """A deterministic predictor without weights."""
 
     model = nn.Module()
+    features = None
 
 
 @dataclass(frozen=True)

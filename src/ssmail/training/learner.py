@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ssmail.config.spec import RunSpec
 from ssmail.envs.integrator import Integrator
+from ssmail.models.features import Features
 from ssmail.training.agent_numbers import turns
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import Stateful
@@ -66,6 +67,11 @@ class Predictor(Protocol):
     @property
     def model(self) -> nn.Module:
         """The network whose weights the loop keeps for the best epoch."""
+        ...
+
+    @property
+    def features(self) -> Features | None:
+        """What the networks read of the states; None if there are no networks."""
         ...
 
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:

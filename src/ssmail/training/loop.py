@@ -27,6 +27,7 @@ from ssmail.training.data_defaults import resolve
 from ssmail.training.evaluators import Evaluator, ForecastEvaluator, LaneEvaluator, LetterEvaluator
 from ssmail.training.landscape_recorder import LandscapeRecorder, landscape_epochs
 from ssmail.training.learner import Learner, LearnerContext
+from ssmail.training.predictor_spec import PredictorSpec
 from ssmail.training.seeding import Generators
 from ssmail.training.trajectory_evaluator import TrajectoryEvaluator
 from ssmail.training.variational import VariationalLearner
@@ -82,6 +83,7 @@ class TrainingLoop:
         context = LearnerContext(resolved, self.experts, self.integrator, self.generators, tuple(others))
         self.learner = LEARNERS[spec.method](context)
         self.evaluator = EVALUATORS[spec.environment](context, self.data)
+        self.predictor_spec = PredictorSpec.of(context, self.learner.predictor)
         self.epoch = 0
         self.improved = False
         self.best = self._as_best(True, math.inf)
@@ -181,8 +183,11 @@ class TrainingLoop:
             raise UnfitState("a weight is not finite")
 
     def best_state_dict(self) -> dict[str, Any]:
-        """Return the weights with the best validation error so far, with their epoch and error."""
-        return {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
+        """Return the weights with the best validation error so far, with their epoch and error, and what a predictor
+        needs beside weights.
+        """
+        best = {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
+        return {**best, "predictor": self.predictor_spec.state_dict()}
 
     def _is_finite(self) -> bool:
         parameters = (p for network in self.learner.networks() for p in network.parameters())

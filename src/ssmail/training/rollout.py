@@ -49,11 +49,19 @@ class PolicyPredictor:
 
         by_number: the training split, for each number of agents.
         """
-        experts = by_number[0]
+        states = by_number[0].states
         features = Features.of(spec, *(batch.states for batch in by_number))
+        made = cls.untrained(spec, features, states.shape[-1], integrator)
+        made.model.to(states.device)
+        return made
+
+    @classmethod
+    def untrained(
+        cls, spec: ModelSpec, features: Features, state_size: int, integrator: Integrator
+    ) -> "PolicyPredictor":
+        """Make a policy with initial weights from torch's global generator that reads these features."""
         bounds = ActionBounds.of(spec, features.normalization)
-        size, action_size = features.size(experts.states.shape[-1]), experts.actions.shape[-1]
-        policy = GraphPolicy(size, action_size, spec, bounds).to(experts.states.device)
+        policy = GraphPolicy(features.size(state_size), state_size // 2, spec, bounds)
         return cls(policy, features, integrator)
 
     @torch.no_grad()

@@ -145,6 +145,11 @@ class VariationalPredictor:
     def _chunk(self, agents: int) -> int:
         return max(1, EDGES // max(agents * (agents - 1), 1)) if self.by_edges else PREDICTION_CHUNK
 
+    @property
+    def features(self) -> Features:
+        """See Predictor."""
+        return self.model.features
+
     @torch.no_grad()
     def free_run(self, observed: Tensor, steps: int, generator: torch.Generator, **reading: Unpack[Reading]) -> Tensor:
         """See Predictor.

@@ -1,0 +1,1 @@
+"""Trained models in use: load the model of a run, forecast with it, and export it."""
