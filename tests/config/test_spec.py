@@ -37,7 +37,7 @@ def test_a_spec_has_the_sections_of_its_method_and_environment(method: str, envi
     assert (made.forecast is not None) is (environment in ("mocap", "trajectories"))
     assert (made.data.yjunction is not None) is (environment == "yjunction")
     assert (made.data.letters is not None) is (environment == "letters")
-    assert (made.data.path is not None) is (environment == "mocap")
+    assert (made.data.path is not None) is (environment in ("mocap", "trajectories"))
 
 
 @pytest.mark.parametrize(
