@@ -51,7 +51,8 @@ class PolicyPredictor:
         """
         experts = by_number[0]
         features = Features.of(spec, *(batch.states for batch in by_number))
-        bounds = ActionBounds.of(spec, features.normalization)
+        velocities = [batch.states[..., batch.actions.shape[-1] :] for batch in by_number]
+        bounds = ActionBounds.of(spec, features.normalization, velocities)
         size, action_size = features.size(experts.states.shape[-1]), experts.actions.shape[-1]
         policy = GraphPolicy(size, action_size, spec, bounds).to(experts.states.device)
         return cls(policy, features, integrator)
