@@ -10,10 +10,13 @@ import torch
 from ssmail.config.experiments import build_spec
 from ssmail.data.recorded_sets import SetParameters, recorded_set, windows
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats
+from ssmail.envs.integrator import Integrator
 from ssmail.errors import InputError
+from ssmail.models.normalization import SPARE, ActionBounds
 from ssmail.training.agent_numbers import batches_by_number
 from ssmail.training.batches import Batch
-from ssmail.training.data_defaults import NOISE_SHARE, SPARE, VARIANCE_SHARE, resolve, wanders
+from ssmail.training.data_defaults import NOISE_SHARE, VARIANCE_SHARE, resolve, wanders
+from ssmail.training.rollout import PolicyPredictor
 
 
 def made_of(frames: Floats, identity: bool = False) -> tuple[ExpertSet, Sequence[Batch]]:
@@ -45,17 +48,29 @@ def test_noise_reach_and_variance_follow_the_changes_of_velocity(units: float) -
     policy = resolve(build_spec("ssail", "trajectories", "smoke"), data, experts)
     assert policy.model is not None
     assert policy.sac is not None
-    assert policy.model.action_step == pytest.approx(SPARE * 2, rel=0.01)
-    assert policy.model.action_bound == pytest.approx(SPARE * 1 + SPARE * 2, rel=0.01)
+    bounds = PolicyPredictor.create(policy.model, experts, Integrator(data.scaling)).model.actor
+    assert float(bounds.step) == pytest.approx(SPARE * 2, rel=0.01)
+    assert float(bounds.high) == pytest.approx(SPARE * 1, rel=0.01)  # of the centre of an action
     expected = math.log(NOISE_SHARE * 2) + 0.5 * math.log(2 * math.pi * math.e)
     assert policy.sac.target_entropy == pytest.approx(expected)
     free = resolve(build_spec("ssail", "trajectories", "smoke", ["model.standardize=false"]), data, experts)
     assert free.model is not None
-    assert free.model.action_step == pytest.approx(SPARE * 2, rel=0.01)
+    bounds = PolicyPredictor.create(free.model, experts, Integrator(data.scaling)).model.actor
+    assert float(bounds.step) == pytest.approx(SPARE * 2, rel=0.01)
     dnri = resolve(build_spec("dnri", "trajectories", "smoke"), data, experts).variational
     assert dnri is not None
     moved = 2 * units / data.scaling.position_span  # by which constant velocity is off in position; 2 in velocity
     assert dnri.variance == pytest.approx(VARIANCE_SHARE * (moved**2 + 4) / 2)
+
+
+def test_each_axis_has_the_reach_of_its_own_changes() -> None:
+    """The second axis changes ten times as much as the first."""
+    velocities = torch.tensor([[1.0, 10.0], [-1.0, -10.0]] * 4).view(1, 8, 1, 2)
+    spec = build_spec("ssail", "trajectories", "smoke").model
+    assert spec is not None
+    bounds = ActionBounds.of(spec, None, [velocities])
+    torch.testing.assert_close(bounds.step, SPARE * torch.tensor([2.0, 20.0]))
+    torch.testing.assert_close(bounds.high, SPARE * torch.tensor([3.0, 30.0]))
 
 
 def test_what_is_given_stays() -> None:

@@ -1,13 +1,18 @@
 """Normalization of features by mean and standard deviation, and the bounds on actions that follow from it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ssmail.config.sections import ModelSpec
 
 STD_FLOOR = 0.1  # smallest standard deviation, as a fraction of the mean over agents: noise is not blown up beyond this
+MOST = 0.999  # share of the observed changes of velocity, and of velocities, that actions reach easily
+SPARE = 1.5  # what actions reach, as a multiple of that
+SMALLEST = 1e-6  # of both, for data in which nothing changes
 CLIP = 5.0  # standard deviations from the mean
 
 
@@ -62,15 +67,32 @@ class ActionBounds:
     high: Tensor
 
     @classmethod
-    def of(cls, spec: ModelSpec, normalization: Normalization | None = None) -> "ActionBounds":
+    def of(
+        cls, spec: ModelSpec, normalization: Normalization | None = None, velocities: Sequence[Tensor] = ()
+    ) -> "ActionBounds":
         """Return the bounds of a spec, which are in scaled units or, with a normalization, in standard deviations
         around the mean velocity.
+
+        velocities: the scaled ones of the training set, (M, T, N, A) for each number of agents. Where a key is null,
+        they decide, axis by axis: `step` is SPARE times the change of velocity that the share MOST of them does not
+        exceed, and the bound SPARE times the distance of velocities from the mean (or 0), and a step.
         """
-        assert spec.action_step is not None  # resolved by then
-        assert spec.action_bound is not None
         if normalization is None:
-            bound = torch.tensor(spec.action_bound)
-            return cls(torch.tensor(spec.action_step), -bound, bound)
-        velocity = normalization.velocity
-        margin = spec.action_bound * velocity.std
-        return cls(spec.action_step * velocity.std, velocity.mean - margin, velocity.mean + margin)
+            mean, unit = torch.tensor(0.0), torch.tensor(1.0)
+        else:
+            mean, unit = normalization.velocity.mean, normalization.velocity.std
+        step, bound = spec.action_step, spec.action_bound
+        reach = step if step is not None else SPARE * _most([part.diff(dim=1) / unit for part in velocities])
+        margin = bound if bound is not None else SPARE * _most([(part - mean) / unit for part in velocities]) + reach
+        return cls(reach * unit, mean - margin * unit, mean + margin * unit)
+
+    def broadcast(self) -> tuple[Tensor, ...]:
+        """Return step, low and high with the same shape."""
+        return torch.broadcast_tensors(self.step, self.low, self.high)
+
+
+def _most(parts: Sequence[Tensor]) -> Tensor:
+    """Return the MOST quantile (A,) of the sizes of vectors' components (M, T, N, A), but SMALLEST at least."""
+    sizes = torch.cat([part.abs().flatten(0, 2) for part in parts])
+    found = np.quantile(sizes.double().cpu().numpy(), MOST, axis=0)
+    return torch.as_tensor(found, dtype=sizes.dtype, device=sizes.device).clamp(min=SMALLEST)

@@ -1,4 +1,7 @@
-"""What a spec leaves to the data: keys that are null or "auto" get their values from the training split."""
+"""What a spec leaves to the data: keys that are null or "auto" get their values from the training split.
+
+The reach of actions, which each axis has of its own, is left to `ssmail.models.normalization.ActionBounds`.
+"""
 
 import math
 from collections.abc import Sequence
@@ -14,12 +17,9 @@ from ssmail.config.spec import RunSpec
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.errors import InputError
-from ssmail.models.features import Features
 from ssmail.training.batches import Batch, to_numpy
 
 WINDOWS_A_PLACE = 10  # absolute positions need so many training windows wherever a group may be
-MOST = 0.999  # quantile of the observed changes of velocity, and of velocities, that actions can reach easily
-SPARE = 1.5  # an action's reach, as a multiple of that quantile
 NOISE_SHARE = 0.1  # standard deviation that the policy's noise aims at, as a fraction of the rms change of velocity
 VARIANCE_SHARE = 0.1  # of the likelihood, as a fraction of constant velocity's squared error after one step
 MISS_SHARE = 0.2  # distance of a miss, as a fraction of the mean distance covered in the predicted frames
@@ -36,8 +36,7 @@ def resolve(spec: RunSpec, data: ExpertSet, experts: Sequence[Batch]) -> RunSpec
     """
     changed: dict[str, BaseModel] = {}
     if spec.model:
-        model = _inputs("model", spec.model, data, experts)
-        changed["model"] = model.model_copy(update=_reach(model, experts))
+        changed["model"] = _inputs("model", spec.model, data, experts)
     if spec.sac and spec.sac.target_entropy is None:
         changed["sac"] = spec.sac.model_copy(update={"target_entropy": _target_entropy(experts)})
     if spec.variational:
@@ -101,18 +100,6 @@ def _inputs(name: str, section: Network, data: ExpertSet, experts: Sequence[Batc
     return section.model_copy(update=updates)
 
 
-def _reach(model: ModelSpec, experts: Sequence[Batch]) -> dict[str, float]:
-    """Return action_step and action_bound where they are null, in the units that the model has them in."""
-    if model.action_step is not None and model.action_bound is not None:
-        return {}
-    known = Features.of(model, *(batch.states for batch in experts)).normalization
-    mean, unit = (known.velocity.mean, known.velocity.std) if known else (torch.tensor(0.0), torch.tensor(1.0))
-    velocities = [(_velocities(batch) - mean) / unit for batch in experts]
-    step = max(SPARE * _quantile([part.diff(dim=1) for part in velocities]), SMALLEST)
-    bound = SPARE * _quantile(velocities) + step
-    return {"action_step": model.action_step or step, "action_bound": model.action_bound or bound}
-
-
 def _target_entropy(experts: Sequence[Batch]) -> float:
     """Return the entropy of an axis, in nats, of Gaussian noise with NOISE_SHARE of the rms change of velocity."""
     changes = torch.cat([_velocities(batch).diff(dim=1).flatten(0, 2) for batch in experts]).double()
@@ -145,8 +132,3 @@ def _forecast(forecast: ForecastSpec, data: ExpertSet) -> ForecastSpec:
 
 def _velocities(batch: Batch) -> Tensor:
     return batch.states[..., batch.actions.shape[-1] :]
-
-
-def _quantile(parts: Sequence[Tensor]) -> float:
-    """Return the MOST quantile of the sizes of all numbers."""
-    return float(np.quantile(np.concatenate([to_numpy(part.abs()).ravel() for part in parts]), MOST))

@@ -3,6 +3,7 @@
 It is stored with the best model, so that a trained model can be used where its expert set is not.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, Self
 
@@ -16,12 +17,12 @@ from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import ExpertSet
 from ssmail.envs.integrator import Integrator
 from ssmail.models.features import Features
-from ssmail.models.normalization import Normalization
+from ssmail.models.normalization import ActionBounds, Normalization
 from ssmail.training.baselines import ConstantVelocity, CopyLast
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import UnfitState, entries, fitted, fitted_number
 from ssmail.training.learner import LearnerContext, Predictor
-from ssmail.training.rollout import PolicyPredictor
+from ssmail.training.rollout import PolicyPredictor, action_bounds
 from ssmail.training.variational import VariationalModel, VariationalPredictor
 
 MOST_AGENTS, MOST_EDGE_TYPES, MOST_AXES = 10_000, 64, 3
@@ -33,27 +34,36 @@ class PredictorSpec:
     """Everything but the weights.
 
     spec: of the run, with what the expert set decided. scaling: that of the training split. state_size: D. features:
-    what the networks read, with their normalization; None for a baseline.
+    what the networks read, with their normalization; None for a baseline. bounds: of a policy's actions; None for other
+    models.
     """
 
     spec: RunSpec
     scaling: Scaling
     state_size: int
     features: Features | None
+    bounds: ActionBounds | None = None
 
     @classmethod
     def of(cls, context: LearnerContext, predictor: Predictor) -> Self:
         """Describe the predictor of a learner."""
         size = context.experts.states.shape[-1]
-        return cls(context.spec, context.integrator.scaling, size, predictor.features)
+        made = cls(context.spec, context.integrator.scaling, size, predictor.features)
+        return made._with_bounds(context.by_number)
 
     @classmethod
     def from_data(cls, spec: RunSpec, data: ExpertSet) -> Self:
         """Fit to the training split of an expert set, as learners do."""
-        states = Batch.from_trajectories(data.train, data.scaling, torch.device("cpu")).states
+        experts = Batch.from_trajectories(data.train, data.scaling, torch.device("cpu"))
         section = spec.model or spec.variational
-        features = None if section is None else Features.of(section, states)
-        return cls(spec, data.scaling, states.shape[-1], features)
+        features = None if section is None else Features.of(section, experts.states)
+        return cls(spec, data.scaling, experts.states.shape[-1], features)._with_bounds([experts])
+
+    def _with_bounds(self, by_number: Sequence[Batch]) -> Self:
+        """Add the bounds of a policy's actions, from the training split for each number of agents."""
+        if self.spec.model is None or self.features is None:
+            return self
+        return replace(self, bounds=action_bounds(self.spec.model, self.features, by_number))
 
     @property
     def agents(self) -> int | None:
@@ -71,13 +81,14 @@ class PredictorSpec:
             "scaling": list(astuple(self.scaling)),
             "state_size": self.state_size,
             "features": None if self.features is None else _described(self.features),
+            "bounds": None if self.bounds is None else self._bounds(torch.stack(self.bounds.broadcast())),
         }
 
     @classmethod
     def from_state(cls, found: Any) -> Self:
         """Inverse of `state_dict`, for what anyone may have written. Raises UnfitState."""
         where = "predictor"
-        state = entries(found, ("spec", "scaling", "state_size", "features"), where)
+        state = entries(found, ("spec", "scaling", "state_size", "features", "bounds"), where)
         try:
             spec = RunSpec.model_validate_json(state["spec"])
         except (ValidationError, TypeError):
@@ -91,7 +102,21 @@ class PredictorSpec:
         if (state["features"] is None) != (spec.model is None and spec.variational is None):
             raise UnfitState(f"{where}.features is of another type")
         features = None if state["features"] is None else _features(state["features"], size, f"{where}.features")
-        return cls(spec, scaling, size, features)
+        made = cls(spec, scaling, size, features)
+        if (state["bounds"] is None) != (spec.model is None):
+            raise UnfitState(f"{where}.bounds is of another type")
+        if features is None or spec.model is None:
+            return made
+        step, low, high = fitted(state["bounds"], made._bounds(torch.zeros(3, 1, 1)), f"{where}.bounds")
+        if not bool((torch.isfinite(low) & torch.isfinite(high) & (step > 0) & (step < torch.inf)).all()):
+            raise UnfitState(f"{where}.bounds is out of range")
+        return replace(made, bounds=ActionBounds(step, low, high))
+
+    def _bounds(self, like: Tensor) -> Tensor:
+        """Expand step, low and high (3, ...) of actions to (3, N, A), with N = 1 if they are those of all agents."""
+        normalization = None if self.features is None else self.features.normalization
+        rows = 1 if normalization is None else len(normalization.mean)
+        return like.expand(3, rows, self.state_size // 2).clone()
 
     def make(self, weights: Any) -> Predictor:
         """Return the predictor with these weights, the state of its network. Raises UnfitState when it is not.
@@ -121,7 +146,8 @@ class PredictorSpec:
             raise UnfitState(f"its networks have more than {MOST_EDGE_TYPES} edge types")
         with torch.random.fork_rng(devices=[]):
             if isinstance(section, ModelSpec):
-                return PolicyPredictor.untrained(section, self.features, self.state_size, integrator)
+                assert self.bounds is not None
+                return PolicyPredictor.untrained(section, self.features, self.bounds, self.state_size, integrator)
             model = VariationalModel(self.features, self.state_size, section, dynamic=spec.method == "dnri")
             return VariationalPredictor(model, integrator)
 

@@ -51,16 +51,17 @@ class PolicyPredictor:
         """
         states = by_number[0].states
         features = Features.of(spec, *(batch.states for batch in by_number))
-        made = cls.untrained(spec, features, states.shape[-1], integrator)
+        made = cls.untrained(
+            spec, features, action_bounds(spec, features, by_number), states.shape[-1], integrator
+        )
         made.model.to(states.device)
         return made
 
     @classmethod
     def untrained(
-        cls, spec: ModelSpec, features: Features, state_size: int, integrator: Integrator
+        cls, spec: ModelSpec, features: Features, bounds: ActionBounds, state_size: int, integrator: Integrator
     ) -> "PolicyPredictor":
         """Make a policy with initial weights from torch's global generator that reads these features."""
-        bounds = ActionBounds.of(spec, features.normalization)
         policy = GraphPolicy(features.size(state_size), state_size // 2, spec, bounds)
         return cls(policy, features, integrator)
 
@@ -134,3 +135,9 @@ class PolicyPredictor:
         a = self.model.action_size
         no_noise = torch.zeros(b, t, n, a, device=now.device)
         return self.integrator.step(now, self.model.actor.sample(x, graphs, now[..., a:], no_noise))
+
+
+def action_bounds(spec: ModelSpec, features: Features, by_number: Sequence[Batch]) -> ActionBounds:
+    """Return the bounds of a policy's actions, from the training split for each number of agents."""
+    velocities = [batch.states[..., batch.actions.shape[-1] :] for batch in by_number]
+    return ActionBounds.of(spec, features.normalization, velocities)
