@@ -213,15 +213,19 @@ def test_any_description_is_read_or_unfit(train: Train, data: st.DataObject) -> 
     trained = train("ssail", "mocap")
     state = deepcopy(trained.loop.predictor_spec.state_dict())
     odd = st.one_of(st.none(), st.integers(), st.floats(), st.text(max_size=5), st.just(torch.zeros(2, 3)), st.just([]))
-    place = data.draw(st.sampled_from(["state_size", "scaling", "features", "steps", "agents", "mean", "std"]))
+    place = data.draw(
+        st.sampled_from(
+            ["state_size", "scaling", "features", "bounds", "steps", "agents", "mean", "std", "step", "low"]
+        )
+    )
     inner = {"steps": state["features"], "agents": state["features"], "mean": state["features"]["normalization"]}
-    inner["std"] = inner["mean"]
+    inner |= {"std": inner["mean"], "step": state["bounds"], "low": state["bounds"]}
     inner.get(place, state)[place] = data.draw(odd)
     try:
         PredictorSpec.from_state(state).make(trained.loop.best["weights"])
     except UnfitState:
         return
-    assert place in ("steps", "scaling") or state == trained.loop.predictor_spec.state_dict()
+    assert place in ("steps", "scaling", "step") or state == trained.loop.predictor_spec.state_dict()
 
 
 def test_a_run_without_its_checkpoints_and_a_database_that_is_not_there(train: Train, tmp_path: Path) -> None:

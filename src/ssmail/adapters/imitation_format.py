@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from ssmail.adapters.packages import missing
 from ssmail.config.foreign_files import open_regular, read_whole
 from ssmail.data.trajectories import Floats, Trajectories
-from ssmail.errors import InputError
+from ssmail.errors import InputError, missing_package
 
 LARGEST_FILE = 2**31  # bytes
 DATA = re.compile(r"data-\d{5}-of-\d{5}\.arrow")
@@ -35,7 +34,7 @@ def write_imitation(trajectories: Trajectories, folder: Path) -> None:
     try:
         from datasets import Dataset
     except ModuleNotFoundError as error:
-        raise missing(error) from None
+        raise missing_package(error, "adapters") from None
     if folder.exists() or folder.is_symlink():
         raise InputError(f"{folder} exists already; choose another folder or delete it")
     positions, velocities, agents = trajectories.positions, trajectories.velocities, trajectories.agents
@@ -99,7 +98,7 @@ def _observations(folder: Path) -> list[Floats]:
     try:
         import pyarrow as pa
     except ModuleNotFoundError as error:
-        raise missing(error) from None
+        raise missing_package(error, "adapters") from None
     if not folder.is_dir():
         raise InputError(
             f"{folder} is not a folder as imitation.data.serialize.save writes it; load an older .npz or .pkl file "

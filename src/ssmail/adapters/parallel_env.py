@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from ssmail.adapters.packages import missing
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats
 from ssmail.envs.integrator import Integrator
-from ssmail.errors import InputError, unknown_name
+from ssmail.errors import InputError, missing_package, unknown_name
 
 try:
     from gymnasium.spaces import Box
     from pettingzoo import ParallelEnv
 except ModuleNotFoundError as error:
-    raise missing(error) from None
+    raise missing_package(error, "adapters") from None
 
 Reward = Callable[[Floats, Floats, Floats], Floats]
 """From the states (N, 2P), the actions (N, P) and the next states (N, 2P) to the rewards (N,), all in raw units."""

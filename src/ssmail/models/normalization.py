@@ -86,10 +86,6 @@ class ActionBounds:
         margin = bound if bound is not None else SPARE * _most([(part - mean) / unit for part in velocities]) + reach
         return cls(reach * unit, mean - margin * unit, mean + margin * unit)
 
-    def broadcast(self) -> tuple[Tensor, ...]:
-        """Return step, low and high with the same shape."""
-        return torch.broadcast_tensors(self.step, self.low, self.high)
-
 
 def _most(parts: Sequence[Tensor]) -> Tensor:
     """Return the MOST quantile (A,) of the sizes of vectors' components (M, T, N, A), but SMALLEST at least."""

@@ -81,7 +81,7 @@ class PredictorSpec:
             "scaling": list(astuple(self.scaling)),
             "state_size": self.state_size,
             "features": None if self.features is None else _described(self.features),
-            "bounds": None if self.bounds is None else self._bounds(torch.stack(self.bounds.broadcast())),
+            "bounds": None if self.bounds is None else self._expanded(self.bounds),
         }
 
     @classmethod
@@ -107,16 +107,20 @@ class PredictorSpec:
             raise UnfitState(f"{where}.bounds is of another type")
         if features is None or spec.model is None:
             return made
-        step, low, high = fitted(state["bounds"], made._bounds(torch.zeros(3, 1, 1)), f"{where}.bounds")
-        if not bool((torch.isfinite(low) & torch.isfinite(high) & (step > 0) & (step < torch.inf)).all()):
+        zero = torch.tensor(0.0)
+        bounds = ActionBounds(
+            **fitted(state["bounds"], made._expanded(ActionBounds(zero, zero, zero)), f"{where}.bounds")
+        )
+        finite = all(bool(torch.isfinite(part).all()) for part in vars(bounds).values())
+        if not finite or not bool((bounds.step > 0).all()):
             raise UnfitState(f"{where}.bounds is out of range")
-        return replace(made, bounds=ActionBounds(step, low, high))
+        return replace(made, bounds=bounds)
 
-    def _bounds(self, like: Tensor) -> Tensor:
-        """Expand step, low and high (3, ...) of actions to (3, N, A), with N = 1 if they are those of all agents."""
+    def _expanded(self, bounds: ActionBounds) -> dict[str, Tensor]:
+        """Return the parts of bounds as (N, A) each, with N = 1 if they are those of all agents."""
         normalization = None if self.features is None else self.features.normalization
         rows = 1 if normalization is None else len(normalization.mean)
-        return like.expand(3, rows, self.state_size // 2).clone()
+        return {name: part.expand(rows, self.state_size // 2).clone() for name, part in vars(bounds).items()}
 
     def make(self, weights: Any) -> Predictor:
         """Return the predictor with these weights, the state of its network. Raises UnfitState when it is not.

@@ -51,9 +51,7 @@ class PolicyPredictor:
         """
         states = by_number[0].states
         features = Features.of(spec, *(batch.states for batch in by_number))
-        made = cls.untrained(
-            spec, features, action_bounds(spec, features, by_number), states.shape[-1], integrator
-        )
+        made = cls.untrained(spec, features, action_bounds(spec, features, by_number), states.shape[-1], integrator)
         made.model.to(states.device)
         return made
 
