@@ -83,7 +83,8 @@ def _compiled(program: Program, onnx: bool) -> dict[str, bytes]:
 
     The networks are traced in their readable form, which has no gradients of its own.
     """
-    arguments, contents = tuple(program.inputs.values()), {}
+    arguments = tuple(value.clone() for value in program.inputs.values())  # one tensor in two places would be one input
+    contents = {}
     with _readable_form(), torch.no_grad(), _quiet():
         traced = torch.export.export(program.module.eval(), arguments)
         written = io.BytesIO()
