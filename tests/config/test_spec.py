@@ -70,7 +70,7 @@ def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict
         (
             "yjunction",
             "forecast.noise=0.1",
-            "method bc on yjunction has no section 'forecast' to set in --set; it belongs to mocap.",
+            "method bc on yjunction has no section 'forecast' to set in --set; it belongs to mocap, trajectories.",
         ),
         ("mocap", "data.yjunction.train=3", "environment mocap has no section 'data.yjunction' to set in --set."),
         ("letters", "data.yjunction.train=3", "environment letters has no section 'data.yjunction' to set in --set."),
@@ -126,9 +126,12 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     assert values["self_supervision"].pop("label") == "identity"
     assert values["model"].pop("initial_scale") == 0.1  # later keys too
     assert values["model"].pop("standardize") is False
+    assert values["model"].pop("centre_relative") is False
     assert values["model"].pop("discriminator_waves") == []
     assert values["sac"].pop("expansion_steps") == 0
+    assert values["sac"].pop("expansion_start") == 0
     assert values["adversarial"].pop("input_noise_final") == 1
+    assert values["adversarial"].pop("input_noise_start") == 0
     before = json.dumps(values, sort_keys=True, separators=(",", ":"))
     assert now.hash() == hashlib.sha256(before.encode()).hexdigest()[:16]
     assert '"label":"identity"' in now.as_json()

@@ -2,12 +2,15 @@
 
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 import torch
 from torch import Tensor
 
 from ssmail.config.experiments import build_spec
+from ssmail.envs.integrator import Integrator
 from ssmail.losses.soft_actor_critic import actor_loss
 from ssmail.training.actor_critic import Reward, SoftActorCritic, Transitions
 from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
@@ -28,9 +31,9 @@ class Setting:
     """Transitions of generated trajectories at four time steps, the last of which is that of the trajectories."""
 
     def __init__(self, expansion_steps: int, *overrides: str) -> None:
-        one, _ = learner(f"sac.expansion_steps={expansion_steps}", *overrides)
+        one, _ = learner(*overrides)
         training = AdversarialTraining([one])
-        self.generators = one.generators
+        self.generators, self.expansion_steps = one.generators, expansion_steps
         self.sac: SoftActorCritic = training.actor_critic
         batch, _ = training.generate(0.0)
         self.at: Transitions = self.sac._transitions(batch, torch.tensor([[7, 0, STEPS - 2, STEPS - 1]]))
@@ -43,7 +46,7 @@ class Setting:
 
     def loss(self, reward: Reward, temperature: Tensor = NO_TEMPERATURE) -> tuple[Tensor, Tensor]:
         self.generators["policy"].manual_seed(3)
-        return self.sac._actor_loss(self.at, temperature, reward)
+        return self.sac._actor_loss(self.at, temperature, reward, self.expansion_steps)
 
 
 def always(value: float) -> Reward:
@@ -56,7 +59,7 @@ def test_without_expansion_it_is_the_plain_loss() -> None:
     loss, log_prob = setting.loss(lambda x, actions: pytest.fail("asked for a reward"), temperature)
     setting.generators["policy"].manual_seed(3)
     at, sac = setting.at, setting.sac
-    action, expected_log_prob = sac._sample(at.x, at.graph, at.states[..., 2:])
+    action, expected_log_prob = sac._sample(sac.policy.actor, at.x, at.graph, at.states[..., 2:])
     action = sac.features.normalize_actions(action)
     assert torch.equal(loss, actor_loss(sac.critic(at.x, action, at.graph), expected_log_prob, temperature))
     assert torch.equal(log_prob, expected_log_prob)
@@ -130,6 +133,21 @@ def test_the_gradient_follows_the_policy_through_the_dynamics() -> None:
             loss.sum(), [setting.sac.policy.actor.head[-1].bias], allow_unused=True, materialize_grads=True
         )
         assert bool(gradient.any()) is moves
+
+
+def test_the_policy_that_acts_afterwards_is_given() -> None:
+    """A reward for the second action reaches the weights through the first one alone: not if the states forget it."""
+    for forgets in (True, False):
+        setting = Setting(2)
+        setting.critics_say(0.0)
+        step = setting.sac.integrator.step
+        if forgets:
+            following = SimpleNamespace(step=lambda states, actions, step=step: step(states, actions).detach())
+            setting.sac.integrator = cast(Integrator, following)
+        factors = iter((0.0, 1.0))
+        loss, _ = setting.loss(lambda x, actions, factors=factors: next(factors) * actions[..., 0])
+        (gradient,) = torch.autograd.grad(loss.sum(), [setting.sac.policy.actor.head[-1].bias])
+        assert bool(gradient.any()) is not forgets
 
 
 def weights(network: torch.nn.Module) -> Tensor:

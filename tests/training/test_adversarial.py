@@ -3,7 +3,7 @@ import torch
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.sections import required
-from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
+from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining, input_noise
 from ssmail.training.batches import Batch
 from ssmail.training.loop import TrainingLoop
 
@@ -54,6 +54,28 @@ def test_only_states_and_actions_are_blurred() -> None:
     assert float((blurred - x)[..., :4].std()) == pytest.approx(0.1, rel=0.05)
     sharp = training("adversarial.input_noise=0")
     assert torch.equal(sharp._add_input_noise(x, features=4), x)
+
+
+def test_the_blur_of_d_falls_from_its_start_on() -> None:
+    """From 0.2 to a sixteenth over the last half of five epochs; by default it stays."""
+    spec = training("adversarial.input_noise=0.2", "adversarial.input_noise_final=0.0625").adversarial
+    falling = [input_noise(spec, epoch, 5) for epoch in range(5)]
+    assert falling == pytest.approx([0.2, 0.1, 0.05, 0.025, 0.0125])
+    late = spec.model_copy(update={"input_noise_start": 0.5})
+    assert [input_noise(late, epoch, 5) for epoch in range(5)] == pytest.approx([0.2, 0.2, 0.2, 0.05, 0.0125])
+    assert input_noise(training("adversarial.input_noise=0.2").adversarial, 4, 5) == 0.2
+
+
+def test_the_actors_objective_expands_from_its_start_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = training("sac.expansion_steps=3", "sac.expansion_start=0.5", "training.epochs=4", "training.updates=1")
+    asked: list[int] = []
+    update = made.actor_critic.update
+    monkeypatch.setattr(
+        made.actor_critic, "update", lambda *a, **k: asked.append(k["expansion_steps"]) or update(*a, **k)
+    )
+    for epoch in range(4):
+        made.run_epoch(epoch)
+    assert asked == [0, 0, 3, 3]
 
 
 def test_tau_alpha_lies_between_its_pair() -> None:

@@ -16,6 +16,7 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Jitter = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
+Start = Annotated[float, Field(ge=0, lt=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 Pairing = Literal["start", "nearest", "assignment"]
@@ -176,6 +177,7 @@ class AdversarialSpec(Frozen):
     input_noise: NonNegative
     # input_noise of the last epoch as a fraction of the first: it falls geometrically, from a coarse to a fine reward
     input_noise_final: Share
+    input_noise_start: Start  # fraction of the epochs before input_noise begins to fall
     reward_scale: Positive
     reward_limit: Positive | None  # rewards are clipped to plus or minus this after scaling; null: no clipping
 
@@ -224,9 +226,10 @@ class SacSpec(Frozen):
     target_entropy: Finite | None  # nats per action dimension of one agent, for actions in scaled units
     # consecutive steps of a trajectory that the encoder's gradient covers in an update (truncated BPTT); null: all
     encoder_steps: Count | None
-    # steps over which the actor's objective follows the policy through the known dynamics and rewards before the
-    # critics estimate the rest (model-based value expansion); 0: the critics estimate all, as in the paper
+    # steps over which an action's value in the actor's objective is computed with the known dynamics and rewards before
+    # the critics estimate the rest (model-based value expansion); 0: the critics estimate all, as in the paper
     expansion_steps: Annotated[int, Field(ge=0, le=100)]
+    expansion_start: Start  # fraction of the epochs before that, in which the critics estimate all
     graph_entropy: NonNegative  # weight of the edge types' entropy in the actor's objective
     # the policy that is evaluated has weights averaged over the updates, of which each counts this fraction (an
     # exponential moving average); null: the current weights

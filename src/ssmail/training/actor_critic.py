@@ -16,7 +16,7 @@ from ssmail.losses import PER_SEED
 from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
 from ssmail.models.critic import TwinCritic
 from ssmail.models.graph_encoder import edge_entropy
-from ssmail.models.policy import GraphPolicy
+from ssmail.models.policy import Actor, GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import entries, fitted, load_part
 from ssmail.training.rollout import PolicyPredictor
@@ -108,7 +108,7 @@ class SoftActorCritic:
         self.policy, policy = stacked_modules([seed.policy for seed in seeds])
         self.critic, critic = stacked_modules([seed.critic for seed in seeds])
         self.target_critic, target = stacked_modules([seed.target_critic for seed in seeds])
-        self.fixed_critic = fixed(self.critic)
+        self.fixed_critic, self.fixed_actor = fixed(self.critic), fixed(self.policy.actor)
         temperature = Block([[seed.log_temperature] for seed in seeds])
         self.log_temperature = nn.Parameter(temperature.parts[0])
         learned: dict[str, tuple[Iterable[nn.Parameter], Block]] = {
@@ -130,24 +130,27 @@ class SoftActorCritic:
         learned = self.log_temperature.detach().exp()
         return learned if self.spec.automatic_temperature else torch.full_like(learned, self.spec.temperature)
 
-    def update(self, batch: Batch, steps: Tensor, reward: Reward, *, actor_learns: bool = True) -> dict[str, Tensor]:
+    def update(
+        self, batch: Batch, steps: Tensor, reward: Reward, *, expansion_steps: int = 0, actor_learns: bool = True
+    ) -> dict[str, Tensor]:
         """Take one SAC step on whole trajectories (S, B, ...), at their time steps `steps` (S, C).
 
-        Rewards are recomputed from the stored states and actions. Without `actor_learns` the policies and their
-        temperatures stay fixed while the critics learn the policies' values. Returns losses and means, (S,) each.
+        Rewards are recomputed from the stored states and actions. expansion_steps: of the actors' objective. Without
+        `actor_learns` the policies and their temperatures stay fixed while the critics learn the policies' values.
+        Returns losses and means, (S,) each.
         """
         at = self._transitions(batch, steps)
         temperature = self.temperature.view(-1, 1, 1, 1)
         # Critics: one regression step to r + gamma * (min target Q - temperature * log pi) of the next state.
         with torch.no_grad():
             rewards = reward(at.x, at.actions)
-            next_action, next_log_prob = self._sample(at.next_x, at.next_graph, at.next_velocity)
+            next_action, next_log_prob = self._sample(self.policy.actor, at.next_x, at.next_graph, at.next_velocity)
             next_q = self.target_critic(at.next_x, self.features.normalize_actions(next_action), at.next_graph)
             target = critic_target(rewards, next_q, next_log_prob, temperature, self.spec.gamma)
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
         self.optimizers["critic"].step(value_loss)
         # Actor and temperature.
-        policy_loss, log_prob = self._update_actor(at, temperature, reward, actor_learns)
+        policy_loss, log_prob = self._update_actor(at, temperature, reward, expansion_steps, actor_learns)
         # Target networks and averaged policies.
         self._update_averages()
         return {
@@ -217,16 +220,16 @@ class SoftActorCritic:
                 logits.append(logit)
         return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2, 3, 4))
 
-    def _sample(self, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
+    def _sample(self, actor: Actor, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
         """Sample actions, in scaled units, with their log-probabilities."""
         noise = normal_like(velocity, self.generators["policy"])
-        return self.policy.actor.sample_with_log_prob(x, graph, velocity, noise)
+        return actor.sample_with_log_prob(x, graph, velocity, noise)
 
     def _update_actor(
-        self, at: Transitions, temperature: Tensor, reward: Reward, learns: bool
+        self, at: Transitions, temperature: Tensor, reward: Reward, expansion_steps: int, learns: bool
     ) -> tuple[Tensor, Tensor]:
         """Take one step of actors and graph encoders, then one of the temperatures; return the losses and log pi."""
-        loss, log_prob = self._actor_loss(at, temperature, reward)
+        loss, log_prob = self._actor_loss(at, temperature, reward, expansion_steps)
         if learns:
             self.optimizers["actor"].step(loss - self.spec.graph_entropy * at.edge_entropy)
         if learns and self.spec.automatic_temperature:
@@ -236,29 +239,34 @@ class SoftActorCritic:
             self.optimizers["temperature"].step(temperature_loss(learned, log_prob, target_entropy))
         return loss, log_prob
 
-    def _actor_loss(self, at: Transitions, temperature: Tensor, reward: Reward) -> tuple[Tensor, Tensor]:
-        """Return minus the soft value (S,) of the policy at the transitions' states, and log pi of its actions there.
+    def _actor_loss(
+        self, at: Transitions, temperature: Tensor, reward: Reward, expansion_steps: int
+    ) -> tuple[Tensor, Tensor]:
+        """Return minus the soft value (S,) of the policy's actions at the transitions' states, and their log pi.
 
-        The value is r + gamma * r' + ... of sac.expansion_steps steps, then that of the critics, each less temperature
-        * log pi (model-based value expansion, Feinberg et al. 2018). Rewards and dynamics are known functions, so the
-        gradient follows the policy through all of these steps (Heess et al. 2015). The graphs are those of the stored
-        trajectory at the same time.
+        The value is r + gamma * r' + ... of `expansion_steps` steps, then that of the critics, each less temperature *
+        log pi (model-based value expansion, Feinberg et al. 2018). Rewards and dynamics are known functions, so the
+        gradient reaches an action through all that follows from it. As in Q(s, a), the policy that acts afterwards is
+        given: a gradient through its weights as well would let the whole group change its lane at once, whatever graph
+        it has (docs/experiments.md). The graphs are those of the stored trajectory at the same time.
         """
-        graph, states, read = at.graph, at.states, at.x
+        states, read = at.states, at.x
         size, last = states.shape[-1], at.graphs.shape[2] - 1
-        action, log_prob = self._sample(read, graph, states[..., size // 2 :])
+        graph, gamma = at.graph.detach(), self.spec.gamma
+        action, log_prob = self._sample(self.policy.actor, read, at.graph, states[..., size // 2 :])
         first_log_prob, earlier = log_prob, torch.zeros_like(log_prob)
-        for k in range(self.spec.expansion_steps):
+        for k in range(expansion_steps):
             rewards = reward(read, self.features.normalize_actions(action))
-            earlier = earlier + self.spec.gamma**k * (rewards - temperature * log_prob)
+            earlier = earlier + gamma**k * (rewards - temperature * log_prob)
             states = self.integrator.step(states, action)
             now = (at.steps + k + 1).clamp(max=last)
             others = at_steps(at.histories, now)[..., size:]
-            read, graph = torch.cat([self.features.normalize_states(states), others], dim=-1), at_steps(at.graphs, now)
-            action, log_prob = self._sample(read, graph, states[..., size // 2 :])
-        q = self.fixed_critic(read, self.features.normalize_actions(action), graph.detach())
+            read = torch.cat([self.features.normalize_states(states), others], dim=-1)
+            graph = at_steps(at.graphs, now).detach()
+            action, log_prob = self._sample(self.fixed_actor, read, graph, states[..., size // 2 :])
+        q = self.fixed_critic(read, self.features.normalize_actions(action), graph)
         tail = actor_loss(q, log_prob, temperature)
-        return self.spec.gamma**self.spec.expansion_steps * tail - earlier.mean(dim=PER_SEED), first_log_prob
+        return gamma**expansion_steps * tail - earlier.mean(dim=PER_SEED), first_log_prob
 
     @torch.no_grad()
     def _update_averages(self) -> None:

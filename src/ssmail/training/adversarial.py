@@ -137,6 +137,17 @@ def scaled_reward(spec: AdversarialSpec, reward: Tensor) -> Tensor:
     return scaled if spec.reward_limit is None else scaled.clamp(-spec.reward_limit, spec.reward_limit)
 
 
+def input_noise(spec: AdversarialSpec, epoch: int, epochs: int) -> float:
+    """Return the standard deviation of D's input noise in epoch 0 .. epochs - 1.
+
+    It is adversarial.input_noise until the fraction input_noise_start of the epochs, then falls geometrically to
+    input_noise_final of it.
+    """
+    passed = (epoch / max(epochs - 1, 1) - spec.input_noise_start) / (1 - spec.input_noise_start)
+    falling: float = spec.input_noise_final ** max(passed, 0.0)
+    return spec.input_noise * falling
+
+
 class AdversarialTraining:
     """Alternates discriminator steps and soft actor-critic steps on trajectories from replay buffers.
 
@@ -153,7 +164,7 @@ class AdversarialTraining:
         self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
         self.experts, self.device = context.experts, context.device  # the experts of this update's number of agents
-        self.input_noise = self.adversarial.input_noise  # of this epoch
+        self.input_noise, self.expansion_steps = self.adversarial.input_noise, 0  # of this epoch
         self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
         self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
         self.discriminator, block = stacked_modules([seed.discriminator for seed in seeds])
@@ -182,10 +193,11 @@ class AdversarialTraining:
             latest[turn], made = self.generate(frequency, max(1, round(share * self.adversarial.rollouts)))
             replay[turn] = self._remember(latest[turn])
             interventions.append(made)
-        final = self.adversarial.input_noise_final ** (epoch / max(self.training.epochs - 1, 1))
-        self.input_noise = self.adversarial.input_noise * final
+        self.input_noise = input_noise(self.adversarial, epoch, self.training.epochs)
         # Warm-up: until sac.actor_start, the fraction of all epochs, only the critics and the discriminator learn.
-        actor_learns = epoch >= (self.actor_critic.spec.actor_start or 0) * self.training.epochs
+        sac, epochs = self.actor_critic.spec, self.training.epochs
+        actor_learns = epoch >= (sac.actor_start or 0) * epochs
+        self.expansion_steps = sac.expansion_steps if epoch >= sac.expansion_start * epochs else 0
         logs = []
         for turn in turns:
             self.experts = self.context.by_number[turn]
@@ -230,7 +242,9 @@ class AdversarialTraining:
         logs = [self._update_discriminator(latest, replay) for _ in range(self.adversarial.updates)]
         batch = self._actor_batch(replay)
         steps = self._pick_steps(batch.actions.shape[2])
-        values = self.actor_critic.update(batch, steps, self.reward, actor_learns=actor_learns)
+        values = self.actor_critic.update(
+            batch, steps, self.reward, expansion_steps=self.expansion_steps, actor_learns=actor_learns
+        )
         means = {name: torch.stack([log[name] for log in logs]).mean(dim=0) for name in logs[0]}
         return means | {name: value.detach() for name, value in values.items()}
 
