@@ -4,8 +4,10 @@ One substitution, `smaller`, makes them small: the profile is smoke instead of q
 ablation over beta has two values.
 """
 
+import math
 import re
 import shlex
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,15 @@ def smaller(command: str) -> list[str]:
     return arguments
 
 
+def write_table(path: Path) -> None:
+    """Write 12 scenes in which two agents walk side by side for 60 frames."""
+    lines = ["scene,frame,agent,x,y"]
+    for scene, frame, agent in product(range(12), range(60), range(2)):
+        x = frame + math.sin(0.3 * frame + scene)
+        lines.append(f"{scene},{frame},{agent},{x:.4f},{5 * agent + 0.1 * x:.4f}")
+    path.write_text("\n".join(lines) + "\n")
+
+
 def test_the_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     ablations = SHIPPED.ablations | {"beta": SHIPPED.ablations["beta"] | {"values": BETAS}}
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(write(tmp_path / "experiments.yaml", ablations=ablations)))
@@ -60,11 +71,13 @@ def test_the_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     assert all(Path(file).is_file() for file in figures)
 
     commands = [command for command in commands_of_readme() if command.startswith("ssmail ")]
-    assert len(commands) == 6
+    assert len(commands) == 9
+    write_table(Path("flock.csv"))
     for command in commands:
         assert run(smaller(command)) == 0, (command, capsys.readouterr().err)
     runs = Store.open("results/ssmail.db").runs()
-    assert sorted(run.method for run in runs) == ["dnri", "ssail", *["ssail"] * len(BETAS)]
+    assert sorted(run.method for run in runs) == ["dnri", "dnri", "ssail", *["ssail"] * len(BETAS)]
+    assert Path("results/figures/forecast_flock.png").is_file()
     assert {run.state for run in runs} == {"finished"}
 
 
