@@ -140,6 +140,15 @@ def test_it_is_no_set_of_another_environment(saved: Path, tmp_path: Path) -> Non
         expert_sets.load(tmp_path / "absent.npz", "trajectories")
 
 
+def test_a_table_is_to_be_imported_first(tmp_path: Path) -> None:
+    table = tmp_path / "walks.csv"
+    table.write_text("scene,frame,agent,x\n")
+    with pytest.raises(InputError, match=r"walks.csv is no expert set; .*`ssmail import-data .*csv --out .*walks.npz`"):
+        expert_sets.load(table, "trajectories")
+    with pytest.raises(InputError, match="truncated"):  # what --env mocap reads is not imported from tables
+        expert_sets.load(table, "mocap")
+
+
 def test_a_set_that_would_be_too_large_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(expert_sets, "LARGEST_FILE", expert_sets.LONGEST_TEXT + 100)
     with pytest.raises(InputError, match=r"the set has 0\.0 GiB, and 2 are the most; make it with fewer windows"):

@@ -117,6 +117,9 @@ def load(path: Path, environment: str | None = None) -> ExpertSet:
     except MemoryError:
         raise broken(f"{path} does not fit into memory", command) from None
     except ARCHIVE_ERRORS:
+        if environment == "trajectories" and path.suffix.lower() != ".npz":
+            remedy = command_line("ssmail", "import-data", path, "--out", path.with_suffix(".npz"))
+            raise InputError(f"{path} is no expert set; make one of it with `{remedy}`") from None
         raise broken(f"{path} is truncated or not an .npz file", command) from None
 
 
