@@ -86,7 +86,8 @@ def make_learner(
 
 def one_step(learner: VariationalLearner) -> dict[str, float]:
     """Train one step under complete teacher forcing and return the metrics of the loss."""
-    return learner._update(torch.ones(learner.training.batch, learner.context.steps, dtype=torch.bool))
+    interventions = torch.ones(learner.training.batch, learner.context.steps, dtype=torch.bool)
+    return learner._update(learner.context.experts, interventions)
 
 
 def first_results(learner: VariationalLearner) -> dict[str, Tensor]:
