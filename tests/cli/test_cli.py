@@ -53,6 +53,8 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "plot skeleton",
         "claims",
         "explain",
+        "forecast",
+        "export-model",
         "runs",
         "runs list",
         "runs show",

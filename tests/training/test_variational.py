@@ -142,7 +142,7 @@ def test_nri_as_published_reads_the_whole_window_and_predicts_from_what_was_obse
     made, seen = learner("nri", "variational.encoder_window=50"), []
     made.model.encoder.register_forward_hook(lambda _, given, logits: seen.append((given[0], logits)))
     always = torch.ones(made.training.batch, made.context.steps, dtype=torch.bool)
-    made._update(always)
+    made._update(made.context.experts, always)
     assert seen[0][0].shape[1] == made.context.steps + 1 == 50  # the last state too, as in the authors' code
     observed = made.context.experts.states[:2, :6]
     made.predictor.free_run(observed, 3, torch.Generator())

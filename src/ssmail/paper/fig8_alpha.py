@@ -43,7 +43,12 @@ from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
 NAME = "fig8"
-ERRORS = {"mocap": "mse", "letters": "mse", "yjunction": "mode_mse"}  # of the upper panel, by environment
+ERRORS = {
+    "mocap": "mse",
+    "letters": "mse",
+    "yjunction": "mode_mse",
+    "trajectories": "mse",
+}  # of the upper panel, by environment
 TERMS = ("discriminator/generated", "discriminator/expert")
 READS = Reads(curves=(*TERMS, *(f"train/{error}" for error in sorted(set(ERRORS.values())))))
 LOSS = " + ".join(TERMS)
