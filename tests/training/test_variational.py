@@ -151,7 +151,7 @@ def test_nri_as_published_reads_the_whole_window_and_predicts_from_what_was_obse
         torch.testing.assert_close(made.model.past_logits(observed)[:, -1:], seen[1][1])
     plain, seen = learner("nri"), []
     plain.model.encoder.register_forward_hook(lambda _, given, logits: seen.append((given[0], logits)))
-    plain._update(always)
+    plain._update(plain.context.experts, always)
     assert seen[0][0].shape[1] == 49  # negative control: the form for any length
 
 
