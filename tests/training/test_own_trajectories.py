@@ -82,6 +82,15 @@ def test_the_kept_windows_are_those_of_the_set(make: Make) -> None:
         assert 0 < step.max() < 10  # the first predicted position is near the last observed one
 
 
+def test_every_kept_sample_of_a_baseline_is_its_forecast(make: Make) -> None:
+    """A figure that draws all samples would draw lines to the origin otherwise."""
+    _, arrays = trained(make("constant-velocity")).final_evaluation()
+    first, *others = arrays["test/samples"]
+    assert np.abs(first).sum() > 0
+    for other in others:
+        np.testing.assert_array_equal(other, first)
+
+
 @pytest.mark.parametrize("method", ["ssail", "nri"])
 def test_a_resumed_run_equals_an_uninterrupted_one(make: Make, method: str) -> None:
     spec = make(method)

@@ -89,7 +89,7 @@ class TrajectoryEvaluator(Evaluator):
     ) -> tuple[dict[str, float], Mapping[str, Floats]]:
         """Forecast windows and return their metrics and curves.
 
-        keep: (S, W, T', N, P), to be filled with the forecasts of the kept test windows.
+        keep: (S, W, T', N, P), to be filled with the forecasts of the kept test windows; all S are the same of a baseline.
         """
         made = 1 if isinstance(predictor, Baseline) and not noisy else samples
         parts, kept, h = [], self._kept().tolist(), self.observed
@@ -106,7 +106,7 @@ class TrajectoryEvaluator(Evaluator):
             for b, window in enumerate(index.tolist() if keep is not None else ()):
                 if keep is not None and window in kept:
                     positions = self.scaling.unscale_positions(predicted[:, b, ..., : states.shape[-1] // 2])
-                    keep[: len(positions), kept.index(window), :, : states.shape[2]] = positions
+                    keep[:, kept.index(window), :, : states.shape[2]] = positions
         return summarize(MeasuredForecasts.join(parts))
 
     def _chunks(self, windows: Trajectories, times: int) -> Iterator[tuple[Integers, Tensor]]:
