@@ -89,7 +89,8 @@ class TrajectoryEvaluator(Evaluator):
     ) -> tuple[dict[str, float], Mapping[str, Floats]]:
         """Forecast windows and return their metrics and curves.
 
-        keep: (S, W, T', N, P), to be filled with the forecasts of the kept test windows; all S are the same of a baseline.
+        keep: (S, W, T', N, P), to be filled with the forecasts of the kept test windows. Those of a baseline are the
+        same for all S.
         """
         made = 1 if isinstance(predictor, Baseline) and not noisy else samples
         parts, kept, h = [], self._kept().tolist(), self.observed
