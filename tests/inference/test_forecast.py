@@ -55,6 +55,16 @@ def test_an_expert_set_is_observed_as_in_the_test_of_the_run(train: Train) -> No
     assert read_windows(trained.set, run, observed=3).positions.shape[1] == 4
 
 
+def test_an_array_of_more_than_some_megabytes_is_read_whole(train: Train, tmp_path: Path) -> None:
+    """As a .npy, and as the only array of a packed .npz."""
+    run = load_run(train("ssail").id, train("ssail").db)
+    large = np.random.default_rng(0).normal(size=(400, 60, 12, 2))  # 4.6 MB
+    np.save(tmp_path / "large.npy", large)
+    np.savez_compressed(tmp_path / "large.npz", large)
+    for name in ("large.npy", "large.npz"):
+        np.testing.assert_array_equal(read_windows(tmp_path / name, run).positions, large)
+
+
 @pytest.fixture
 def arguments(train: Train, tmp_path: Path) -> list[str]:
     """`ssmail forecast` of two windows by a run of ssail."""

@@ -122,6 +122,12 @@ class NpzFile:
             raise self.fault(f"{self.path} holds no array {key!r}, so it is not an expert set of ssmail")
         return self.headers[key]
 
+    def only_or(self, key: str) -> str | None:
+        """Return `key` if there is such an array, otherwise the name of the only one; None if there are several."""
+        if key in self.headers:
+            return key
+        return next(iter(self.headers)) if len(self.headers) == 1 else None
+
     def require_exactly(self, *keys: str) -> None:
         """Raise InputError if an array is missing, or if there are others."""
         for key in keys:

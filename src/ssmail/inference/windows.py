@@ -1,18 +1,16 @@
 """The windows to forecast: the test split of an expert set, or an array of positions from anyone."""
 
-import io
-import math
 import os
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 
-from ssmail.config.foreign_files import ARCHIVE_ERRORS, is_plain, open_regular, read_whole
+from ssmail.config.foreign_files import ARCHIVE_ERRORS, open_regular
 from ssmail.data.expert_sets import load
-from ssmail.data.npz_file import LARGEST_FILE
+from ssmail.data.npz_file import LARGEST_FILE, Header, NpzFile
 from ssmail.data.trajectories import ExpertSet, Floats, Integers
 from ssmail.errors import InputError
 from ssmail.inference.trained_run import TrainedRun
@@ -44,14 +42,14 @@ def read_windows(path: Path, run: TrainedRun, observed: int | None = None) -> Wi
     """
     try:
         with open_regular(path) as file:
-            packed = zipfile.is_zipfile(file)
+            packed, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
             file.seek(0)
-            if packed:
-                with zipfile.ZipFile(file) as archive:
-                    if set(archive.namelist()) >= _SET_ARRAYS:
-                        return _of_set(load(path, run.spec.environment), run, observed)
-                    return _of_array(_packed_array(archive, path), path, observed)
-            return _of_array(_array(file, os.fstat(file.fileno()).st_size, path), path, observed)
+            if not packed:
+                return _of_array(_single_array(file, size, path), path, observed)
+            with zipfile.ZipFile(file) as archive:
+                if set(archive.namelist()) >= _SET_ARRAYS:
+                    return _of_set(load(path, run.spec.environment), run, observed)
+                return _of_array(_packed_array(NpzFile(path, REMEDY, archive, size, packed=True)), path, observed)
     except FileNotFoundError:
         raise InputError(f"there is no file {path}; {REMEDY}") from None
     except ARCHIVE_ERRORS as error:
@@ -68,10 +66,9 @@ def _of_set(experts: ExpertSet, run: TrainedRun, observed: int | None) -> Window
         raise InputError(f"--observed is from 1 to {frames}, the frames of a test window, not {count}.")
     before = test.positions[:, :1] - test.velocities[:, :1]  # the first velocity is that from this frame
     positions = np.concatenate([before, test.positions[:, :count]], axis=1)
-    agents = getattr(test, "agents", None)
     every = np.full(len(test), positions.shape[2], dtype=np.int64)
     steps = run.predicted or parameters.get("predicted")
-    return Windows(positions, every if agents is None else agents, steps if isinstance(steps, int) else None)
+    return Windows(positions, every if test.agents is None else test.agents, steps if isinstance(steps, int) else None)
 
 
 def _of_array(positions: Floats, path: Path, observed: int | None) -> Windows:
@@ -83,34 +80,35 @@ def _of_array(positions: Floats, path: Path, observed: int | None) -> Windows:
     return Windows(positions[:, :count], every)
 
 
-def _packed_array(archive: zipfile.ZipFile, path: Path) -> Floats:
+def _packed_array(file: NpzFile) -> Floats:
     """Return the array `positions` of an .npz file, or the only one."""
-    members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-    name = "positions" if "positions" in members or len(members) != 1 else next(iter(members))
-    if name not in members:
-        raise InputError(f"{path} holds {len(members)} arrays, and none is called positions; {REMEDY}")
-    if not is_plain(members[name]):
-        raise InputError(f"the array in {path} is encrypted or packed in an unusual way; {REMEDY}")
-    with archive.open(members[name]) as file:
-        content = read_whole(file, LARGEST_FILE)
-    if content is None:
-        raise InputError(f"{path} is larger than 2 GiB; split it")
-    return _array(io.BytesIO(content), len(content), path)
+    key = file.only_or("positions")
+    if key is None:
+        raise file.fault(f"{file.path} holds {len(file.headers)} arrays, and none is called positions")
+    if file.header(key).dtype.kind == "U":
+        raise _no_numbers(file.path)
+    return _checked(file.values(key), file.path)
 
 
-def _array(file: IO[bytes], size: int, path: Path) -> Floats:
-    """Read a .npy file of `size` bytes. Raises InputError if it is no array of numbers with four axes."""
-    version = np.lib.format.read_magic(file)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, fortran, dtype = read(file)
-    count = math.prod(shape)
-    if dtype.kind not in "fiu" or size > LARGEST_FILE or file.tell() + count * dtype.itemsize != size:
-        raise InputError(f"{path} is no array of numbers as large as it says; {REMEDY}")
-    if len(shape) != 4 or not count or shape[3] > 3:
-        shown = " x ".join(map(str, shape[:6]))
+def _single_array(file: IO[bytes], size: int, path: Path) -> Floats:
+    """Return the array of a .npy file of `size` bytes."""
+    header = Header.read(file)
+    if header is None or header.dtype.kind == "U" or header.size != size or size > LARGEST_FILE:
+        raise _no_numbers(path)
+    return _checked(header.values(file), path)
+
+
+def _no_numbers(path: Path) -> InputError:
+    kinds = "of floats or signed integers"
+    return InputError(f"{path} cannot be read: it is no array of numbers as large as it says, {kinds}; {REMEDY}")
+
+
+def _checked(values: Any, path: Path) -> Floats:
+    """Return an array as positions. Raises InputError unless it has four axes and is finite."""
+    if values.ndim != 4 or not values.size or values.shape[3] > 3:
+        shown = " x ".join(map(str, values.shape[:6]))
         raise InputError(f"the array in {path} is {shown} instead of (M, T, N, P) with P of 1 to 3; reshape it")
-    values = np.frombuffer(file.read(), dtype)
-    array: Floats = values.reshape(shape, order="F" if fortran else "C").astype(np.float64)
+    array: Floats = values.astype(np.float64)
     if not np.isfinite(array).all():
         raise InputError(f"the array in {path} holds NaN or infinite values; leave these windows out")
     return array

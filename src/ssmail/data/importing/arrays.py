@@ -51,8 +51,8 @@ def _key(file: NpzFile, label: str) -> str:
     """Return the name of the array with the positions."""
     if {"parameters", "hash", "train/positions"} <= file.headers.keys():
         raise InputError(f"{label} is an expert set already; train on it with --set data.path")
-    key = KEY if KEY in file.headers or len(file.headers) != 1 else next(iter(file.headers))
-    if key not in file.headers:
+    key = file.only_or(KEY)
+    if key is None:
         raise InputError(f"{label} holds {len(file.headers)} arrays, none of them called {KEY}; {REMEDY}")
     if file.header(key).dtype.kind == "U":
         raise InputError(f"the array {key!r:.40} of {label} holds text; {REMEDY}")
