@@ -12,7 +12,7 @@ from ssmail.adapters.collecting import collect_episodes, expert_set
 from ssmail.adapters.imitation_format import read_imitation, write_imitation
 from ssmail.adapters.parallel_env import TrajectoryEnv
 from ssmail.data import expert_sets
-from ssmail.data.importing.dataset import ImportOptions
+from ssmail.data.importing.dataset import ImportOptions, import_set
 from ssmail.data.trajectories import ExpertSet
 from ssmail.errors import InputError
 from tests.adapters.bouncing_box import BouncingBox
@@ -118,3 +118,14 @@ def test_bad_positions_end_as_one_sentence() -> None:
             collect_episodes(world, home, bad, episodes=1)
     with pytest.raises(InputError, match="the longest possible is --window 30"):
         expert_set(collected(steps=30), ImportOptions(window=40))
+    with pytest.raises(InputError, match=r"of scene_00001 has the shape 1x30x2 "):
+        expert_set([np.zeros((30, 3, 2)), np.zeros((30, 2))])
+    with pytest.raises(InputError, match="collect some episodes"):
+        expert_set([])
+
+
+def test_a_set_of_scenes_is_that_of_their_files(tmp_path: Path) -> None:
+    for number, scene in enumerate(collected()):
+        np.save(tmp_path / f"scene_{number:05d}.npy", scene[None])
+    from_files, _ = import_set([tmp_path], ImportOptions(window=10, observed=4))
+    assert collected_set().hash == from_files.hash

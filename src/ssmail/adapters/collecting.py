@@ -1,14 +1,14 @@
 """Expert sets from episodes: play them in any PettingZoo parallel environment, or bring their positions along."""
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ssmail.data.importing.dataset import ImportOptions, import_set
+from ssmail.data.importing.arrays import add_array
+from ssmail.data.importing.dataset import ImportOptions, set_of_rows
+from ssmail.data.importing.rows import RowCollector, SourceFile
 from ssmail.data.trajectories import ExpertSet, Floats
 from ssmail.errors import InputError
 
@@ -81,8 +81,11 @@ def expert_set(scenes: Sequence[Floats], options: ImportOptions | None = None) -
     They are cut into windows and split by scene as `ssmail import-data` does it, with the same options; a window of T
     states takes T + 1 frames. Row n counts as the same agent in all scenes. Raises InputError as it does.
     """
-    with tempfile.TemporaryDirectory() as folder:
-        for number, scene in enumerate(scenes):
-            np.save(Path(folder, f"scene_{number:05d}.npy"), scene[None], allow_pickle=False)
-        experts, _ = import_set([Path(folder)], options or ImportOptions())
-    return replace(experts, sources={})
+    if not scenes:
+        raise InputError("an expert set needs scenes, and there are none; collect some episodes")
+    collector = RowCollector()
+    for number, scene in enumerate(scenes):
+        name = f"scene_{number:05d}"
+        add_array(scene[None], "the array", SourceFile(Path(name), name), collector)
+    experts, _ = set_of_rows(collector.finish(), options or ImportOptions(), "the scenes")
+    return experts

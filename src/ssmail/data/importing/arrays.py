@@ -26,12 +26,12 @@ def read_array(file: SourceFile, collector: RowCollector) -> None:
         with open_regular(file.path) as opened:
             size = os.fstat(opened.fileno()).st_size
             if file.path.suffix.lower() == ".npy":
-                _add(_single(opened, size, file.label), "the array", file, collector)
+                add_array(_single(opened, size, file.label), "the array", file, collector)
             else:
                 with zipfile.ZipFile(opened) as archive:
                     found = NpzFile(file.path, REMEDY, archive, size, packed=True)
                     key = _key(found, file.label)
-                    _add(found.values(key), f"the array {key!r:.40}", file, collector)
+                    add_array(found.values(key), f"the array {key!r:.40}", file, collector)
     except ARCHIVE_ERRORS as error:
         if isinstance(error, FileNotFoundError | PermissionError):
             raise
@@ -59,8 +59,11 @@ def _key(file: NpzFile, label: str) -> str:
     return key
 
 
-def _add(array: Any, what: str, file: SourceFile, collector: RowCollector) -> None:
-    """Add the rows of an array (M, T, N, P), agent by agent."""
+def add_array(array: Any, what: str, file: SourceFile, collector: RowCollector) -> None:
+    """Add the rows of an array (M, T, N, P), agent by agent, with all that `file` has. what: the array in messages.
+
+    Raises InputError for another shape, and for positions that are not finite or too large.
+    """
     if array.ndim != 4 or not 1 <= array.shape[3] <= 3 or not array.size:
         shape = "x".join(map(str, array.shape[:6]))
         raise InputError(

@@ -1,6 +1,6 @@
 """Import anyone's recorded agents: from files to an expert set (docs/data-format.md)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ssmail.data.importing.cutting import Windows, check_size, cut, longest, nearest
-from ssmail.data.importing.rows import quoted
+from ssmail.data.importing.rows import Rows, quoted
 from ssmail.data.importing.sources import find_files, read_files
 from ssmail.data.importing.splitting import Shares, named_scenes, split_scenes, split_times
 from ssmail.data.importing.summary import Summary, summarize
@@ -72,9 +72,19 @@ def import_set(
 
     Raises InputError for anything in the files that cannot be used, and if there is no window for each split.
     """
-    options.parameters(1)
+    options.parameters(1)  # refuse what cannot be before files are read
     files = find_files(sources)
     rows, digests = read_files(files, options.columns, report)
+    return set_of_rows(rows, options, quoted(sources[0], 80), digests)
+
+
+def set_of_rows(
+    rows: Rows, options: ImportOptions, label: str, digests: Mapping[str, str] | None = None
+) -> tuple[ExpertSet, Summary]:
+    """Make an expert set from rows. label: what they come from, in messages. digests: the SHA-256 of their files.
+
+    Raises InputError for rows that cannot be used, and if there is no window for each split.
+    """
     params = options.parameters(rows.positions.shape[1])
     tracks, repairs = make_tracks(rows, options.dt, options.fill_gaps)
     parts, params = _parts(tracks, rows.scenes, params, options)
@@ -90,8 +100,8 @@ def import_set(
         splits[split] = _trajectories(part, agents, numbers[begin : begin + len(part)])
         begin += len(part)
     experts = recorded_set(splits, scenes, params, digests)
-    _check_scaling(experts, sources)
-    return experts, summarize(rows, tracks, repairs, parts, params, len(files))
+    _check_scaling(experts, label)
+    return experts, summarize(rows, tracks, repairs, parts, params)
 
 
 def _parts(
@@ -154,8 +164,7 @@ def _trajectories(part: Windows, agents: int, scene: Integers) -> Trajectories:
     return windows(part.positions(agents), part.agents, scene, frame)
 
 
-def _check_scaling(experts: ExpertSet, sources: Sequence[Path]) -> None:
-    label = quoted(sources[0], 80)
+def _check_scaling(experts: ExpertSet, label: str) -> None:
     try:
         _ = experts.scaling
     except ValueError:

@@ -29,13 +29,11 @@ class Summary:
     remarks: Sequence[str]
 
 
-def summarize(
-    rows: Rows, tracks: Tracks, repairs: Repairs, parts: Sequence[Windows], params: SetParameters, files: int
-) -> Summary:
+def summarize(rows: Rows, tracks: Tracks, repairs: Repairs, parts: Sequence[Windows], params: SetParameters) -> Summary:
     """Summarize an import. parts: the windows of the three splits."""
     used = np.unique(np.concatenate([part.scene for part in parts]))
     return Summary(
-        files,
+        len(rows.files),
         len(rows),
         len(rows.scenes),
         {split: _counts(part) for split, part in zip(SPLITS, parts, strict=True)},
