@@ -14,11 +14,7 @@ from ssmail.errors import InputError
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event
 from ssmail.store import RunRow, RunState, Store
-
-LAST, BEST = "last.pt", "best.pt"
-"""Names of the checkpoints of a run."""
-LASTS = (LAST, "last.2.pt")
-"""Names of the two files in checkpoint_root/<run id>/ that hold LAST in turn while the run is trained."""
+from ssmail.store.checkpoint_files import LASTS
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Kind, RunSettings
-from ssmail.execution.planning import BEST, LAST, LASTS, Plan, plan_cell
+from ssmail.execution.planning import Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.store.checkpoint_files import run_folder
+from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
 from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
 

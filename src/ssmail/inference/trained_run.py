@@ -17,9 +17,8 @@ from ssmail.data.expert_sets import generate, load
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import LARGEST_SCALED, Floats
 from ssmail.errors import InputError
-from ssmail.execution.planning import BEST, LAST, LASTS
 from ssmail.store import RunRow, Store
-from ssmail.store.checkpoint_files import run_folder
+from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
 from ssmail.store.connection import as_url
 from ssmail.store.maintenance.sqlite_file import existing
 from ssmail.training.batches import to_numpy

@@ -6,7 +6,6 @@ is the newest run that finished or diverged. Baselines are drawn as references b
 left out. Explicit run ids replace this choice: then each spec is a group of its own.
 """
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from ssmail.config.experiments_file import load_experiments
 from ssmail.config.spec import METHODS
 from ssmail.errors import command_line, printable, shortened
 from ssmail.plots import NoRuns
+from ssmail.plots.formatting import as_file_name
 from ssmail.plots.run_groups import (
     Family,
     Group,
@@ -45,8 +45,8 @@ class DataSet:
 
     @property
     def file_name(self) -> str:
-        """The name with nothing but letters, digits and signs that are harmless in a file's name."""
-        return re.sub(r"[^A-Za-z0-9_.+=-]", "-", self.name)
+        """The name as a part of a file's name."""
+        return as_file_name(self.name)
 
     def selection(self, named: bool = False) -> Selection:
         """Return the default choice among the runs, or every run if the caller `named` them."""

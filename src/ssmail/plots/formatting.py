@@ -1,6 +1,7 @@
 """Numbers, times and values of a spec, as people read them."""
 
 import math
+import re
 from typing import Any
 
 
@@ -58,3 +59,8 @@ def spans(numbers: list[int]) -> str:
         else:
             parts.append([value])
     return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts)
+
+
+def as_file_name(text: str) -> str:
+    """Replace all but letters, digits and signs that are harmless in a file's name by hyphens."""
+    return re.sub(r"[^A-Za-z0-9_.+=-]", "-", text)

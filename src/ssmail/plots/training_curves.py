@@ -7,7 +7,6 @@ than once (same spec, same seed) the newest with the metric is drawn. `curves.ca
 """
 
 import difflib
-import re
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +22,7 @@ from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, silent
-from ssmail.plots.formatting import counted
+from ssmail.plots.formatting import as_file_name, counted
 from ssmail.plots.metric_units import label, last_part
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, by_spec, check_one_data_set, newest_of_each_seed
@@ -60,7 +59,7 @@ class TrainingRecord:
     @property
     def stem(self) -> str:
         """The files' name without ending: other metrics, other files."""
-        names = "_".join(re.sub(r"[^A-Za-z0-9_.+=-]", "-", panel.metric) for panel in self.panels)
+        names = "_".join(as_file_name(panel.metric) for panel in self.panels)
         return f"{NAME}_{names}"[:100]
 
     def table(self) -> pd.DataFrame:

@@ -15,6 +15,10 @@ from ssmail.errors import InputError
 from ssmail.store.queries import ArtifactRow
 from ssmail.store.schema import is_run_id
 
+LAST, BEST = "last.pt", "best.pt"
+"""Names of the checkpoints of a run."""
+LASTS = (LAST, "last.2.pt")
+"""Names of the two files in checkpoint_root/<run id>/ that hold LAST in turn while the run is trained."""
 STAGING = ".merge-"
 """Prefix of the folder that holds copies until a merge needs them; a merge that is killed leaves it behind."""
 LARGEST = 8 * 2**30  # bytes of a checkpoint; those of the paper's sizes have a thousandth of it
