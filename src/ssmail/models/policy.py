@@ -26,7 +26,7 @@ class Actor(nn.Module):
 
     def __init__(self, inputs: int, action_size: int, spec: ModelSpec, bounds: ActionBounds | None = None) -> None:
         super().__init__()
-        bounds = bounds or ActionBounds.of(spec)
+        self.bounds = bounds = bounds or ActionBounds.of(spec)
         self.register_buffer("step", bounds.step, persistent=False)
         self.register_buffer("low", bounds.low + bounds.step, persistent=False)
         self.register_buffer("high", bounds.high - bounds.step, persistent=False)

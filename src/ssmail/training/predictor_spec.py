@@ -3,7 +3,6 @@
 It is stored with the best model, so that a trained model can be used where its expert set is not.
 """
 
-from collections.abc import Sequence
 from dataclasses import asdict, astuple, dataclass, replace
 from typing import Any, Self
 
@@ -47,9 +46,9 @@ class PredictorSpec:
     @classmethod
     def of(cls, context: LearnerContext, predictor: Predictor) -> Self:
         """Describe the predictor of a learner."""
+        bounds = predictor.model.actor.bounds if isinstance(predictor, PolicyPredictor) else None
         size = context.experts.states.shape[-1]
-        made = cls(context.spec, context.integrator.scaling, size, predictor.features)
-        return made._with_bounds(context.by_number)
+        return cls(context.spec, context.integrator.scaling, size, predictor.features, bounds)
 
     @classmethod
     def from_data(cls, spec: RunSpec, data: ExpertSet) -> Self:
@@ -57,13 +56,8 @@ class PredictorSpec:
         experts = Batch.from_trajectories(data.train, data.scaling, torch.device("cpu"))
         section = spec.model or spec.variational
         features = None if section is None else Features.of(section, experts.states)
-        return cls(spec, data.scaling, experts.states.shape[-1], features)._with_bounds([experts])
-
-    def _with_bounds(self, by_number: Sequence[Batch]) -> Self:
-        """Add the bounds of a policy's actions, from the training split for each number of agents."""
-        if self.spec.model is None or self.features is None:
-            return self
-        return replace(self, bounds=action_bounds(self.spec.model, self.features, by_number))
+        bounds = action_bounds(spec.model, features, [experts]) if spec.model and features else None
+        return cls(spec, data.scaling, experts.states.shape[-1], features, bounds)
 
     @property
     def agents(self) -> int | None:
