@@ -127,7 +127,7 @@ def _shares(text: str) -> tuple[int, int, int]:
 
 
 def _print_summary(experts: "ExpertSet", summary: "Summary", out: Path, as_json: bool) -> None:
-    """Print what came in, and on stderr what may not be meant."""
+    """Print what came in, and on stderr what may be a mistake."""
     if as_json:
         write_json(
             {

@@ -168,6 +168,6 @@ def _check_scaling(experts: ExpertSet, label: str) -> None:
     try:
         _ = experts.scaling
     except ValueError:
-        raise InputError(f"nothing moves in the training windows of {label}; is it the right column of each?") from None
+        raise InputError(f"nothing moves in the training windows of {label}; are these the right columns?") from None
     if not experts.is_scalable:
         raise InputError(f"the positions in {label} differ too much in size to be scaled alike; leave the largest out")

@@ -1,4 +1,4 @@
-"""What came in with an import, what was left out, and what may not be meant."""
+"""What came in with an import, what was left out, and what may be a mistake."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ class Summary:
     """What came in. speeds: median, 99 % and maximum of the speeds, in units per step, or per second with dt.
 
     splits: split -> its scenes, windows, and the least and most agents of a window. left_out: what -> how many.
-    remarks: sentences about what may not be meant.
+    remarks: sentences about what may be a mistake.
     """
 
     files: int
