@@ -130,6 +130,7 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     assert values["model"].pop("discriminator_waves") == []
     assert values["sac"].pop("expansion_steps") == 0
     assert values["sac"].pop("expansion_start") == 0
+    assert values["sac"].pop("finite_horizon") is False
     assert values["adversarial"].pop("input_noise_final") == 1
     assert values["adversarial"].pop("input_noise_start") == 0
     before = json.dumps(values, sort_keys=True, separators=(",", ":"))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ssmail.config.experiments import build_spec
 from ssmail.envs.integrator import Integrator
-from ssmail.losses.soft_actor_critic import actor_loss
+from ssmail.losses.soft_actor_critic import soft_value
 from ssmail.training.actor_critic import Reward, SoftActorCritic, Transitions
 from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
 from ssmail.training.checkpoint import UnfitState, load_checkpoint, save_checkpoint
@@ -32,7 +32,7 @@ class Setting:
 
     def __init__(self, expansion_steps: int, *overrides: str) -> None:
         one, _ = learner(*overrides)
-        training = AdversarialTraining([one])
+        self.training = training = AdversarialTraining([one])
         self.generators, self.expansion_steps = one.generators, expansion_steps
         self.sac: SoftActorCritic = training.actor_critic
         batch, _ = training.generate(0.0)
@@ -61,7 +61,8 @@ def test_without_expansion_it_is_the_plain_loss() -> None:
     at, sac = setting.at, setting.sac
     action, expected_log_prob = sac._sample(sac.policy.actor, at.x, at.graph, at.states[..., 2:])
     action = sac.features.normalize_actions(action)
-    assert torch.equal(loss, actor_loss(sac.critic(at.x, action, at.graph), expected_log_prob, temperature))
+    value = soft_value(sac.critic(at.x, action, at.graph), expected_log_prob, temperature)
+    assert torch.equal(loss, -value.mean(dim=(-3, -2, -1)))
     assert torch.equal(log_prob, expected_log_prob)
     expanded, _ = Setting(1).loss(always(0.0), temperature)  # negative control
     assert not torch.equal(loss, expanded)
@@ -78,6 +79,35 @@ def test_a_constant_reward_is_worth_its_discounted_sum(steps: int) -> None:
         assert loss.tolist() == [pytest.approx(-earned - GAMMA**steps * rest, rel=1e-5)]
     without, _ = setting.loss(always(0.0))  # negative control
     assert (float(without.detach()) == float(loss.detach())) is (steps == 0)
+
+
+@pytest.mark.parametrize("steps", [0, 3])
+def test_with_a_finite_horizon_nothing_counts_after_the_last_step(steps: int) -> None:
+    """Of rewards of 2 and critics of 5, a transition with m steps left counts min(m, steps) rewards, and the critics if
+    m > steps.
+    """
+    endless, finite = Setting(steps), Setting(steps, "sac.finite_horizon=true")
+    left = [STEPS - step for step in (7, 0, STEPS - 2, STEPS - 1)]
+    expected = [sum(GAMMA**k * 2.0 for k in range(min(m, steps))) + (m > steps) * GAMMA**steps * 5.0 for m in left]
+    for setting, same in ((finite, True), (endless, steps == 0)):  # the second is the negative control
+        setting.critics_say(5.0)
+        loss, _ = setting.loss(always(2.0))
+        assert (float(loss.detach()) == pytest.approx(-sum(expected) / len(expected), rel=1e-5)) is same
+
+
+def test_with_a_finite_horizon_critics_learn_that_nothing_follows_the_last_step() -> None:
+    """Critics that say 0 are to learn 2 + gamma * 5, of target critics that say 5, and 2 at the last step."""
+    fixed_temperature = ("sac.automatic_temperature=false", "sac.temperature=0")
+    for horizon, at_the_end in (("true", 2.0), ("false", 2.0 + GAMMA * 5.0)):
+        setting = Setting(0, *fixed_temperature, f"sac.finite_horizon={horizon}")
+        sac, before = setting.sac, 2.0 + GAMMA * 5.0
+        for critic, value in ((sac.critic, 0.0), (sac.target_critic, 5.0)):
+            with torch.no_grad():
+                critic.last.weight.zero_()
+                critic.last.bias.fill_(value)
+        batch, _ = setting.training.generate(0.0)
+        losses = sac.update(batch, torch.tensor([[STEPS - 2, STEPS - 1]]), always(2.0))
+        assert losses["critic/loss"].tolist() == [pytest.approx(before**2 + at_the_end**2, rel=1e-5)]
 
 
 def test_every_step_pays_for_its_log_probability() -> None:

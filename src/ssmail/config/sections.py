@@ -230,6 +230,9 @@ class SacSpec(Frozen):
     # the critics estimate the rest (model-based value expansion); 0: the critics estimate all, as in the paper
     expansion_steps: Annotated[int, Field(ge=0, le=100)]
     expansion_start: Start  # fraction of the epochs before that, in which the critics estimate all
+    # whether nothing counts that would come after a trajectory's last step, as the time in model.time_input tells;
+    # otherwise the critics estimate it, at a time that they never learn from
+    finite_horizon: bool
     graph_entropy: NonNegative  # weight of the edge types' entropy in the actor's objective
     # the policy that is evaluated has weights averaged over the updates, of which each counts this fraction (an
     # exponential moving average); null: the current weights

@@ -57,6 +57,7 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("adversarial", "input_noise_start", 0.0),
     ("sac", "expansion_steps", 0),
     ("sac", "expansion_start", 0.0),
+    ("sac", "finite_horizon", False),
     ("sac", "average", None),
     ("variational", "encoder_window", None),
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),

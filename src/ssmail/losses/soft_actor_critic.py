@@ -4,8 +4,8 @@ Tensors are (B, T, N) and Q-values of the twin critics (B, T, N, 2), with an axi
 are scalars, or (S,). Temperatures are scalars or broadcast to the tensors.
 
 Implementations of SAC differ silently in some choices. In ssmail the target entropy is given per action dimension
-(spec: sac.target_entropy), the temperature loss is on the log temperature, and no state is terminal, because episodes
-end by truncation only.
+(spec: sac.target_entropy), the temperature loss is on the log temperature, and episodes end by truncation: no state is
+terminal, unless sac.finite_horizon says that nothing comes after a trajectory's last step.
 """
 
 import torch
@@ -14,20 +14,19 @@ from torch import Tensor
 from ssmail.losses import PER_SEED
 
 
-def critic_target(reward: Tensor, next_q: Tensor, next_log_prob: Tensor, temperature: Tensor, gamma: float) -> Tensor:
-    """r + gamma * (min_k Q_k(s', a') - temperature * log pi(a' | s')), without a gradient."""
-    soft_value = torch.minimum(*next_q.unbind(dim=-1)) - temperature * next_log_prob
-    return (reward + gamma * soft_value).detach()
+def soft_value(q: Tensor, log_prob: Tensor, temperature: Tensor) -> Tensor:
+    """min_k Q_k(s, a) - temperature * log pi(a | s), for an action a of the policy."""
+    return torch.minimum(*q.unbind(dim=-1)) - temperature * log_prob
+
+
+def critic_target(reward: Tensor, next_value: Tensor, gamma: Tensor | float) -> Tensor:
+    """r + gamma * V(s'), without a gradient. gamma broadcasts to the rewards; it is 0 where s' is terminal."""
+    return (reward + gamma * next_value).detach()
 
 
 def critic_loss(q: Tensor, target: Tensor) -> Tensor:
     """Mean squared error of each critic, summed over the two."""
     return (q - target.unsqueeze(-1)).square().sum(dim=-1).mean(dim=PER_SEED)
-
-
-def actor_loss(q: Tensor, log_prob: Tensor, temperature: Tensor) -> Tensor:
-    """Mean of temperature * log pi(a | s) - min_k Q_k(s, a)."""
-    return (temperature.detach() * log_prob - torch.minimum(*q.unbind(dim=-1))).mean(dim=PER_SEED)
 
 
 def temperature_loss(log_temperature: Tensor, log_prob: Tensor, target_entropy: float) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import SacSpec
 from ssmail.losses import PER_SEED
-from ssmail.losses.soft_actor_critic import actor_loss, critic_loss, critic_target, temperature_loss
+from ssmail.losses.soft_actor_critic import critic_loss, critic_target, soft_value, temperature_loss
 from ssmail.models.critic import TwinCritic
 from ssmail.models.graph_encoder import edge_entropy
 from ssmail.models.policy import Actor, GraphPolicy
@@ -146,7 +146,8 @@ class SoftActorCritic:
             rewards = reward(at.x, at.actions)
             next_action, next_log_prob = self._sample(self.policy.actor, at.next_x, at.next_graph, at.next_velocity)
             next_q = self.target_critic(at.next_x, self.features.normalize_actions(next_action), at.next_graph)
-            target = critic_target(rewards, next_q, next_log_prob, temperature, self.spec.gamma)
+            next_value = soft_value(next_q, next_log_prob, temperature)
+            target = critic_target(rewards, next_value, self._discount(at, 1))
         value_loss = critic_loss(self.critic(at.x, at.actions, at.graph.detach()), target)
         self.optimizers["critic"].step(value_loss)
         # Actor and temperature.
@@ -252,12 +253,12 @@ class SoftActorCritic:
         """
         states, read = at.states, at.x
         size, last = states.shape[-1], at.graphs.shape[2] - 1
-        graph, gamma = at.graph.detach(), self.spec.gamma
+        graph = at.graph.detach()
         action, log_prob = self._sample(self.policy.actor, read, at.graph, states[..., size // 2 :])
-        first_log_prob, earlier = log_prob, torch.zeros_like(log_prob)
+        first_log_prob, value = log_prob, torch.zeros_like(log_prob)
         for k in range(expansion_steps):
             rewards = reward(read, self.features.normalize_actions(action))
-            earlier = earlier + gamma**k * (rewards - temperature * log_prob)
+            value = value + self._discount(at, k) * (rewards - temperature * log_prob)
             states = self.integrator.step(states, action)
             now = (at.steps + k + 1).clamp(max=last)
             others = at_steps(at.histories, now)[..., size:]
@@ -265,8 +266,18 @@ class SoftActorCritic:
             graph = at_steps(at.graphs, now).detach()
             action, log_prob = self._sample(self.fixed_actor, read, graph, states[..., size // 2 :])
         q = self.fixed_critic(read, self.features.normalize_actions(action), graph)
-        tail = actor_loss(q, log_prob, temperature)
-        return gamma**expansion_steps * tail - earlier.mean(dim=PER_SEED), first_log_prob
+        value = value + self._discount(at, expansion_steps) * soft_value(q, log_prob, temperature)
+        return -value.mean(dim=PER_SEED), first_log_prob
+
+    def _discount(self, at: Transitions, ahead: int) -> Tensor | float:
+        """Return what the value `ahead` steps after the transitions counts: gamma**ahead, or with a finite horizon
+        (S, 1, C, 1) with zeros where the trajectory has ended by then.
+        """
+        discount: float = self.spec.gamma**ahead
+        if not self.spec.finite_horizon:
+            return discount
+        follows = at.steps + ahead < at.graphs.shape[2] - 1
+        return discount * follows.to(at.x.dtype).unsqueeze(1).unsqueeze(-1)
 
     @torch.no_grad()
     def _update_averages(self) -> None:
