@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+WIDEST = 120  # columns of running text, however wide the terminal is
 LONGEST_CELL = 4000  # characters in a table; a traceback has fewer
 Row = Mapping[str, Any]
 

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
