@@ -7,7 +7,7 @@ a fraction of a second. What cannot be read completes nothing.
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -103,12 +103,8 @@ def _query(ctx: typer.Context, table: str, select: str, *values: str | int) -> l
 
 
 def _database(ctx: typer.Context) -> str:
-    """Return the value of --db, which in `ssmail plot` belongs to the group."""
-    from ssmail_cli.options import DEFAULT_DATABASE
-
-    context: typer.Context | None = ctx
-    while context is not None:
-        if given := context.params.get("db"):
-            return str(given)
-        context = context.parent  # type: ignore[assignment]
-    return DEFAULT_DATABASE
+    """Return the value of --db or its default; in `ssmail plot` the option belongs to the group."""
+    context: Any = ctx
+    while context is not None and not context.params.get("db"):
+        context = context.parent
+    return str(context.params["db"]) if context else ""

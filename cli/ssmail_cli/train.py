@@ -65,7 +65,7 @@ def train(
     chosen_seeds = parse_seeds(seeds)
     chosen = list(dict.fromkeys([*(names or ()), *(methods or ())])) or ["ssail"]
     places = list(dict.fromkeys(environments or ())) or ["yjunction"]
-    sweep = {}
+    sweep: dict[Cell, dict[str, Any]] = {}
     for environment, method in product(places, chosen):
         spec = build_spec(method, environment, profile, settings or [])
         labels = {"method": method} if len(chosen) > 1 else {}
