@@ -86,7 +86,7 @@ def print_results(rows: Rows, sweep: Sweep, form: Format) -> None:
     """Print a row for each cell. A table and CSV have the columns that matter, JSON has all."""
     columns = {**_name_columns(sweep), **_result_columns(sweep)}
     if form is Format.CSV:
-        rows = [{key: row[key] for key in columns} for row in rows]
+        rows = [{key: row.get(key) for key in columns} for row in rows]
     print_rows(rows, columns, form)
 
 

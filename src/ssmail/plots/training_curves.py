@@ -100,6 +100,7 @@ def collect(
         drawn |= {run.id: run for group in groups for run in group.runs}
         curve_of |= {run.id: group.label for group in groups for run in group.runs}
         notes += left_out
+        notes += curve_notes.compact(store, metric, [run for group in groups for run in group.runs], values)
         if panels[-1].logarithmic:
             notes += curve_notes.cut(panels[-1].bands)
     options = {"metrics": [panel.metric for panel in panels], "group_by": group_by, "statistic": statistic}
