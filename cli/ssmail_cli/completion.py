@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
+from typer.core import TyperArgument, TyperOption
 
 from ssmail.config.names import ENVIRONMENTS, METHODS, flatten
 from ssmail.errors import InputError
@@ -18,9 +19,17 @@ from ssmail.paper.results import CLAIMS, FIGURES
 if TYPE_CHECKING:
     from ssmail.config.experiments_file import Experiments
 
+ASKED = "_SSMAIL_COMPLETE"
+"""The environment variable with which a shell asks for completions instead of running a command."""
 MOST_IDS = 200
 _SECONDS = 0.2  # for a query
 _NAME = re.compile(r"[\w./-]+", re.ASCII)  # what is completed: a shell evaluates no character of it
+
+
+def take_values_as_they_are() -> None:
+    """Let Typer convert no value in this process: it imports pydantic for that, and Tab would have to wait."""
+    for kind in (TyperArgument, TyperOption):
+        kind.process_value = lambda _, ctx, value: value  # type: ignore[method-assign]
 
 
 def methods() -> list[str]:

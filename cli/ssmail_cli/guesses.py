@@ -116,8 +116,9 @@ def _leaves(group: Any, path: str = "ssmail") -> dict[str, list[str]]:
 
 def unknown_option(name: str, ctx: Any) -> str:
     """Return a sentence about an option that the command does not have, with what was meant."""
-    command = ctx.command_path
-    meant = _option_meant(name, [option for parameter in ctx.command.params for option in parameter.opts])
+    command, group = ctx.command_path, ctx.parent
+    params = [*ctx.command.params, *(group.command.params if group and group.parent else ())]  # plot has its --out
+    meant = _option_meant(name, [option for parameter in params for option in parameter.opts])
     hint = f"did you mean {meant}?" if meant else f"`{command} --help` lists those it has."
     return f"`{command}` has no option {shortened(name, 60)}; {hint}"
 

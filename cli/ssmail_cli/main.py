@@ -9,7 +9,20 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError, shortened
-from ssmail_cli import claims, datasets, db, explain, forecast, import_data, plot, report, reproduce, runs, train
+from ssmail_cli import (
+    claims,
+    completion,
+    datasets,
+    db,
+    explain,
+    forecast,
+    import_data,
+    plot,
+    report,
+    reproduce,
+    runs,
+    train,
+)
 from ssmail_cli.command_group import Commands
 from ssmail_cli.guesses import unknown_option
 from ssmail_cli.output import (
@@ -110,6 +123,8 @@ def run(arguments: list[str]) -> int:
     os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         try:
+            if completion.ASKED in os.environ:
+                completion.take_values_as_they_are()
             code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
         finally:
             print_remarks()

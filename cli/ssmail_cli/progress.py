@@ -50,11 +50,10 @@ def reporter(sweep: Sweep) -> Iterator[Report]:
 
 def _legend(sweep: Sweep) -> str:
     """Return what the columns of the live lines mean."""
-    errors = dict.fromkeys(environment_metrics(cell.spec.environment).validation for cell in sweep)
     if not any(cell.spec.epochs for cell in sweep):
         return "columns: run, what it does, time it took"
-    meaning = f"val: {' or '.join(errors)}; disc, critic, actor, loss: losses in training"
-    return f"columns: run, epochs done, what it does ({meaning}), time left"
+    errors = dict.fromkeys(environment_metrics(cell.spec.environment).validation for cell in sweep)
+    return f"columns: run, epochs done, val ({' or '.join(errors)}) and losses in training, time left"
 
 
 class _Log:

@@ -40,22 +40,25 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, a
 def announce(store: "Store", sweep: Sweep, jobs: int, resume: Resume) -> None:
     """Print on stderr what a sweep will compute: a line for all of its runs, and one for each of several specs.
 
-    The time is estimated from the stored runs, and left out where those say nothing about it.
+    The time is estimated from the stored runs; where only smaller ones are stored, as the least that it takes.
     """
-    from ssmail.execution.planning import estimated_seconds, total_seconds
+    from ssmail.execution.planning import estimated_seconds, least_seconds, total_seconds
 
     of_spec: dict[RunSpec, list[Cell]] = {}
     for cell in sweep:
         of_spec.setdefault(cell.spec, []).append(cell)
-    seconds = estimated_seconds(store.runs(state="finished"), list(of_spec))
+    finished = store.runs(state="finished")
+    seconds = estimated_seconds(finished, list(of_spec))
+    least = {spec: least_seconds(finished, spec) for spec, known in seconds.items() if known is None}
     new = [cell for cell in sweep if resume is Resume.NEVER or not _is_settled(store, cell)]
 
     def work(cells: "Collection[Cell]") -> str:
         ahead = [cell for cell in new if cell in cells]
-        known = [each for cell in ahead if (each := seconds[cell.spec]) is not None]
         parts = [f"{len(cells) - len(ahead)} stored, {len(ahead)} to train"] if len(ahead) < len(cells) else []
-        if ahead and len(known) == len(ahead):
-            parts.append(f"about {duration(total_seconds(known, jobs))}")
+        known = [each for cell in ahead if (each := seconds[cell.spec] or least.get(cell.spec)) is not None]
+        if known:
+            is_whole = len(known) == len(ahead) and not any(cell.spec in least for cell in ahead)
+            parts.append(f"{'about' if is_whole else 'more than'} {duration(total_seconds(known, jobs))}")
         return "".join(f"; {part}" for part in parts)
 
     note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}{work(sweep)}")
@@ -151,6 +154,7 @@ def print_plan(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
         {**names, "action": action, "run": run and run[:8], "spec_hash": cell.spec.hash()}
         for (cell, names), (action, run) in zip(sweep.items(), actions.values(), strict=True)
     ]
+    note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}")
     columns = {**_name_columns(sweep), "action": "would", "run": "run", "spec_hash": "spec"}
     print_rows(rows, columns, chosen_format(as_json, None))
 

@@ -88,8 +88,13 @@ def test_what_is_no_database_completes_nothing(tmp_path: Path) -> None:
     assert complete(f"ssmail runs show --db {file} ") == []
 
 
-def test_completing_imports_nothing_slow() -> None:
-    asked = "from ssmail_cli import completion as c; c.settings(), c.profiles(), c.ablations(), c.methods(), c.claims()"
-    code = f"import sys, ssmail_cli.main; {asked}; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert SLOW & set(loaded.stdout.split()) == set()
+@pytest.mark.parametrize("line", ["ssmail train --set sac.", "ssmail plot fig4 --runs 0", "ssmail ablate "])
+def test_completing_imports_nothing_slow(line: str, stored: Store, db: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SSMAIL_DB", str(db))
+    code = (
+        "import atexit, sys; atexit.register(lambda: print(*sys.modules, file=sys.stderr)); import ssmail_cli.__main__"
+    )
+    asked = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" ")), "_SSMAIL_COMPLETE": "complete_bash"}
+    done = subprocess.run([sys.executable, "-c", code], env={**os.environ, **asked}, capture_output=True, text=True)
+    assert "typer" in done.stderr.split()
+    assert SLOW & set(done.stderr.split()) == set()

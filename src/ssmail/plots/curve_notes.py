@@ -43,8 +43,8 @@ def compact(store: Store, metric: str, runs: Sequence[RunRow], values: pd.DataFr
 
     values: the stored ones, a row for each run and step. A metric of the test has no other value anyway.
     """
-    stored = values.groupby("run_id").size()
-    single = [run for run in runs if stored.get(run.id) == 1 and store.is_compact(run)]
+    steps = {str(run_id): list(own) for run_id, own in values.groupby("run_id")["step"]}
+    single = [run for run in runs if len(steps[run.id]) == 1 < steps[run.id][0] and store.is_compact(run)]
     if not single or metric.startswith("test"):
         return ()
     return (
