@@ -16,8 +16,9 @@ venv: $(INSTALLED)  ## the virtual environment, with the versions of constraints
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "ssmail needs Python 3.11 or newer; give one with: make PYTHON=python3.12" >&2; exit 1; }
+	@echo "Installing ssmail and about 120 packages into .venv, a few minutes and 2 GB; most of it is PyTorch."
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[dev,adapters]'
+	$(BIN)/pip install -c constraints.txt -e '.[dev,adapters]'
 	@touch $@
 
 demo: $(INSTALLED)  ## train SS-AIL on the Y-Junction (a few minutes) and draw its figures
@@ -43,7 +44,7 @@ check: $(INSTALLED)  ## lint, format and types
 	$(BIN)/mypy
 
 $(DOCS_INSTALLED): $(INSTALLED)
-	$(BIN)/pip install --quiet -c constraints.txt -e '.[docs]'
+	$(BIN)/pip install -c constraints.txt -e '.[docs]'
 	@touch $@
 
 docs: $(DOCS_INSTALLED)  ## the documentation site, with command and API reference, in build/docs; a warning fails it

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail_cli import options
-from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, short, write_json
+from ssmail.errors import command_line
+from ssmail_cli import completion, options
+from ssmail_cli.output import WIDEST, Format, chosen_format, note, print_rows, print_table, say, short, write_json
 
 if TYPE_CHECKING:
     from ssmail.paper.claims import Part, Sample
@@ -25,7 +26,8 @@ SUMMARY = {
     "p_holm": "p (Holm)",
     "more_seeds": "more seeds",
 }
-WIDEST = 120  # columns of text
+SPARE = ("profile", "more_seeds", "p", "corrected", "p_holm")  # what a narrow terminal leaves out first
+NAMES = "C1 to C8, or stability, modes, beta, noise, alpha, curricula, landscapes, vector-field"
 LEGEND = (
     "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns count all "
     "eight claims; docs/claims.md has the tests and thresholds."
@@ -33,11 +35,17 @@ LEGEND = (
 
 
 def claims(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="CLAIM",
+            help=f"Only these claims, with their parts and the value of every seed: {NAMES}.",
+            autocompletion=completion.claims,
+        ),
+    ] = None,
     only: Annotated[
         str | None,
-        typer.Option(
-            "--only", metavar="CLAIM[,CLAIM...]", help="Only these claims: C1 or stability.", show_default="all"
-        ),
+        typer.Option("--only", metavar="CLAIM[,CLAIM...]", help="The same, with commas between.", show_default="all"),
     ] = None,
     profile: options.FigureProfile = None,
     as_json: options.Json = False,
@@ -46,28 +54,32 @@ def claims(
 ) -> None:
     """Judge the paper's claims C1 to C8 by the stored runs: supported, contradicted or inconclusive.
 
-    Each part of a claim has a statistic and an exact test at 0.05, both fixed beforehand (docs/claims.md), and is also
-    corrected for all eight claims by Holm's method. Every seed counts. CSV has a row for each part, JSON everything.
+    Prints a table of the verdicts, and of the claims that are named what each is decided by. Each part of a claim has a
+    statistic and an exact test at 0.05, both fixed beforehand (docs/claims.md), and is also corrected for all eight
+    claims by Holm's method. Every seed counts. CSV has a row for each part, JSON everything.
     """
     from ssmail.paper.judgement import judge
 
     store = options.open_store(db)
-    wanted = [name.strip() for name in only.split(",")] if only is not None else None
+    wanted = options.named(names, only)
     judgements = judge(store, profile, wanted)
     kind = chosen_format(as_json, form)
     if kind is Format.JSON:
         write_json([_as_json(found) for found in judgements], None)
         return
-    for found in judgements:
-        for remark in found.notes:
-            note(f"{found.claim.name}: {remark}")
+    if kind is Format.CSV or wanted:
+        for found in judgements:
+            note(*(f"{found.claim.name}: {remark}" for remark in found.notes))
     if kind is Format.CSV:
         print_rows([row for found in judgements for row in _part_rows(found)], {}, kind)
         return
-    for found in judgements:
-        say(*_claim_lines(found), "")
-    print_table([_summary(found) for found in judgements], SUMMARY)
+    print_table([_summary(found) for found in judgements], SUMMARY, spare=SPARE)
     say(*_wrapped(LEGEND, 0))
+    for found in judgements if wanted else ():
+        say("", *_claim_lines(found))
+    if not wanted:
+        command = command_line("ssmail", "claims", "C4", *(() if db == options.DEFAULT_DATABASE else ("--db", db)))
+        say(*_wrapped(f"`{command}` shows what C4 is decided by: its parts, their tests, every seed.", 0))
 
 
 def _summary(found: "Judgement") -> dict[str, Any]:
@@ -144,11 +156,11 @@ def _claim_lines(found: "Judgement") -> list[str]:
 
 
 def _part_lines(part: "Part") -> list[str]:
-    lines = [f"  - {part.statement}: {part.verdict}{_lack(part)}"]
+    lines = _wrapped(f"- {part.statement}: {part.verdict}{_lack(part)}", 2)
     lines += _wrapped(part.statistic, 6) + _wrapped(part.test, 6)
     if not part.reason:
         value, low, high = (short(float(number), 3) for number in part.effect)
-        chances = f"p = {short(part.p_for, 2)} in favour, {short(part.p_against, 2)} against"
+        chances = f"p\xa0=\xa0{short(part.p_for, 2)} in favour, {short(part.p_against, 2)} against"
         lines += _wrapped(f"{part.effect_is}: {value}, 90 % interval {low} to {high}; {chances}", 6)
     for sample in part.samples:
         lines += _wrapped(_seeds(sample), 6)
@@ -166,11 +178,15 @@ def _lack(part: "Part") -> str:
 
 def _seeds(sample: "Sample") -> str:
     pairs = zip(sample.seeds, sample.values, strict=True)
-    values = ", ".join(f"{seed}: {'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in pairs)
+    values = ", ".join(f"{seed}:\xa0{'unknown' if math.isnan(value) else short(value, 3)}" for seed, value in pairs)
     return f"{sample.label}, seed by seed: {values or 'no runs'}"
 
 
 def _wrapped(text: str, indent: int) -> list[str]:
+    """Return the text as lines that the terminal can show, broken at spaces alone, but at no non-breaking one."""
     width = min(shutil.get_terminal_size().columns, WIDEST)
     margin = " " * indent
-    return textwrap.wrap(text, width, initial_indent=margin, subsequent_indent=margin, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        text, width, initial_indent=margin, subsequent_indent=margin, break_on_hyphens=False, break_long_words=False
+    )
+    return [line.replace("\xa0", " ") for line in lines]

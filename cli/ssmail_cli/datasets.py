@@ -138,7 +138,7 @@ def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_j
     Raises InputError for an invalid option.
     """
     from ssmail.config.experiments import build_spec
-    from ssmail.config.spec import METHODS
+    from ssmail.config.names import METHODS
     from ssmail.data import expert_sets
 
     given = {key: value for key, value in ctx.params.items() if key not in ("out", "force", "as_json")}

@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError, stored_values
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
+from ssmail_cli.command_group import Commands
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, write_json
 
 if TYPE_CHECKING:
@@ -18,7 +19,18 @@ if TYPE_CHECKING:
     from ssmail.store.maintenance.run_rows import Difference
     from ssmail.store.maintenance.sqlite_file import DatabaseInformation
 
-app = typer.Typer(help="Inspect, check, back up, merge and export an SQLite database.", rich_markup_mode=None)
+
+class DatabaseGroup(Commands):
+    """`ssmail db` alone shows what the database holds."""
+
+    ALONE = "info"
+
+
+app = typer.Typer(
+    cls=DatabaseGroup,
+    help="Inspect, check, back up, merge and export an SQLite database; `ssmail db` alone shows what it holds.",
+    rich_markup_mode=None,
+)
 
 COUNT_COLUMNS = {"environment": "env", "method": "method", "profile": "profile", "state": "state", "runs": "runs"}
 Json = Annotated[bool, typer.Option("--json", help="Print JSON.")]

@@ -14,6 +14,7 @@ from ssmail_cli.output import Format, chosen_format, note, print_rows, say, shor
 if TYPE_CHECKING:
     from ssmail.paper.explanation import Agreement, Explanation
 
+NAMED = 3  # runs that a sentence names; the table has all
 COLUMNS = {name: name for name in ("curve", "run", "seed", "state", "spec", "differs", "data", "code", "database")}
 
 
@@ -62,10 +63,13 @@ def _heading(found: "Explanation") -> list[str]:
 def _verdict(agreement: "Agreement | None", db: str) -> str:
     if agreement is None:
         return f"there is no database {db} to compare with; name one with --db"
-    changed = sum(state not in ("same", "missing") for state in agreement.runs.values())
-    missing = sum(state == "missing" for state in agreement.runs.values())
-    of = f"of {len(agreement.runs)} runs"
-    parts = [f"{missing} {of} missing"] * bool(missing) + [f"{changed} {of} changed"] * bool(changed)
+    missing = [run[:8] for run, state in agreement.runs.items() if state == "missing"]
+    changed = [f"{run[:8]} ({state})" for run, state in agreement.runs.items() if state not in ("same", "missing")]
+    parts = [
+        f"{len(runs)} of {len(agreement.runs)} runs {what}: {', '.join(runs[:NAMED])}{', ...' * (len(runs) > NAMED)}"
+        for runs, what in ((missing, "missing"), (changed, "changed"))
+        if runs
+    ]
     if agreement.agrees:
         return f"{agreement.where} agrees: it holds all runs, with the same values"
     if agreement.values == "different":

@@ -1,5 +1,6 @@
 """The command line of `ssmail plot`, on which several figures may be named at once."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,11 +8,13 @@ from typer.core import TyperGroup
 
 from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
+from ssmail_cli.command_group import Commands
 
 ALL = "all"
+_RUN = re.compile("[0-9a-f]{4,32}")  # a run, or the beginning of its id
 
 
-class FigureGroup(TyperGroup):
+class FigureGroup(Commands):
     """A group whose command line may name several things to draw, with options before, between and after the names.
 
     `plot fig4 --out X fig5 --profile quick` is read as `plot --out X` followed by the lines `fig4 --profile quick` and
@@ -34,9 +37,11 @@ class FigureGroup(TyperGroup):
         """Parse the line of every command, then run the commands."""
         lines = ctx.meta["lines"]
         if not lines:
-            super().invoke(ctx)  # fails with "Missing command."
+            raise InputError("name what to draw, such as fig4 or all; `ssmail plot --help` lists what there is.")
         for name, *_ in lines:
             if name not in self.commands:
+                if _RUN.fullmatch(name):
+                    raise InputError(f"{name} is no figure; name a run with --run, or those of a figure with --runs.")
                 raise unknown_name("figure", name, [*FIGURES, *self.commands])
         if len(lines) > 1 and any(name == ALL for name, *_ in lines):
             raise InputError(f"{ALL} is every figure already; give it alone.")

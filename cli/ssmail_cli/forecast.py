@@ -9,7 +9,6 @@ from ssmail.errors import InputError, shortened
 from ssmail_cli import options
 from ssmail_cli.output import note, say, write_json
 
-RunId = Annotated[str, typer.Argument(metavar="RUN", help="The id of a run, or its first digits.")]
 ModelOption = Annotated[
     str, typer.Option("--model", help="best: with the smallest validation error; last: of the last epoch.")
 ]
@@ -20,7 +19,7 @@ DataOption = Annotated[
 
 
 def forecast(
-    run: RunId,
+    run: options.RunId,
     data: Annotated[
         Path,
         typer.Argument(
@@ -75,7 +74,7 @@ def forecast(
 
 
 def export_model(
-    run: RunId,
+    run: options.RunId,
     out: Annotated[Path, typer.Option("--out", help="The folder to write.")],
     agents: Annotated[
         int | None,

@@ -1,6 +1,5 @@
 """The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
-import difflib
 import os
 import re
 import sys
@@ -10,18 +9,43 @@ import typer
 
 from ssmail import __version__
 from ssmail.errors import ExitCode, SsmailError, shortened
-from ssmail_cli import claims, datasets, db, explain, forecast, import_data, plot, report, reproduce, runs, train
-from ssmail_cli.output import OutputError, complain, discard_stdout, error_line, guard_streams, print_remarks, say
+from ssmail_cli import (
+    claims,
+    completion,
+    datasets,
+    db,
+    explain,
+    forecast,
+    import_data,
+    plot,
+    report,
+    reproduce,
+    runs,
+    train,
+)
+from ssmail_cli.command_group import Commands
+from ssmail_cli.guesses import unknown_option
+from ssmail_cli.output import (
+    WIDEST,
+    OutputError,
+    complain,
+    discard_stdout,
+    error_line,
+    guard_streams,
+    print_remarks,
+    say,
+)
 
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
 
 app = typer.Typer(
     name="ssmail",
+    cls=Commands,
     help="Run, store and redraw the experiments of SS-MAIL (Self-Supervised Multi-Agent Imitation Learning).",
     epilog="Exit codes: 0 done, 1 failure, 2 wrong usage or input, 3 some runs unfinished or missing, 130 interrupted.",
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDEST},
 )
 app.command("generate-yjunction")(datasets.generate_yjunction)
 app.command("generate-letters")(datasets.generate_letters)
@@ -48,13 +72,36 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
+def _names(ctx: typer.Context) -> list[str]:
+    """Return the commands that the words before name, for the shell to complete."""
+    group: Any = ctx.find_root().command
+    for word in ctx.params.get("words") or ():
+        group = getattr(group, "commands", {}).get(word)
+    return list(getattr(group, "commands", {}))
+
+
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+        bool,
+        typer.Option(
+            "--version", "-v", "-V", callback=_print_version, is_eager=True, help="Print the version and exit."
+        ),
     ] = False,
 ) -> None:
     """The options of ssmail itself."""
+
+
+@app.command("help")
+def show_help(
+    ctx: typer.Context,
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="COMMAND", help="A command: train, or plot fig4.", autocompletion=_names),
+    ] = None,
+) -> None:
+    """Show the help of a command, as its --help does."""
+    ctx.find_root().command.main([*(words or []), "--help"], prog_name="ssmail", standalone_mode=False)
 
 
 def main() -> None:
@@ -76,6 +123,8 @@ def run(arguments: list[str]) -> int:
     os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         try:
+            if completion.ASKED in os.environ:
+                completion.take_values_as_they_are()
             code = app(arguments or ["--help"], prog_name="ssmail", standalone_mode=False)
         finally:
             print_remarks()
@@ -106,12 +155,9 @@ def _complain(sentence: str, code: int) -> int:
 
 
 def _usage(error: Any) -> str:
-    """Return Typer's error as one sentence on one line, with only the nearest option."""
+    """Return Typer's error as one sentence on one line."""
     if hasattr(error, "option_name") and hasattr(error, "possibilities"):  # an unknown option
-        command = error.ctx.command_path
-        near = difflib.get_close_matches(error.option_name, error.possibilities or [], n=1, cutoff=0)
-        hint = f"did you mean {near[0]}?" if near else f"`{command} --help` lists those it has."
-        return f"`{command}` has no option {error.option_name}; {hint}"
+        return unknown_option(error.option_name, error.ctx)
     sentence = " ".join(error.format_message().split())
     sentence = sentence.replace("Value error, ", "").replace(": Input should", ": it should")
     return sentence[:1].lower() + sentence[1:]

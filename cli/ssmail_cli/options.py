@@ -1,16 +1,18 @@
-"""Options that several commands share, and the functions that read their values."""
+"""Options that several commands share, what the shell completes of them, and the functions that read their values."""
 
+import re
 from contextlib import suppress
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ssmail.errors import InputError, SsmailError, command_line, shortened, unknown_name
+from ssmail.config.names import ENVIRONMENTS, METHODS
+from ssmail.errors import InputError, SsmailError, command_line, shortened, suggestion, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
-from ssmail.plots.formatting import counted
+from ssmail.plots.formatting import counted, listed
+from ssmail_cli import completion
 from ssmail_cli.output import Format, note_at_end
 
 if TYPE_CHECKING:
@@ -21,14 +23,10 @@ DEFAULT_DATABASE = "results/ssmail.db"
 DEFAULT_OUT = Path("results/figures")
 DEFAULT_FORMATS = ["png"]
 MOST_SEEDS = 1000
-
-
-class Device(StrEnum):
-    """Where to compute."""
-
-    AUTO = "auto"
-    CPU = "cpu"
-    CUDA = "cuda"
+STATES = ("queued", "running", "finished", "failed", "diverged", "interrupted")
+AUTO = "auto"
+DEVICES = (AUTO, "cpu", "cuda")
+_DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,3})?", re.ASCII)
 
 
 def _known_formats(formats: list[str]) -> list[str]:
@@ -39,6 +37,14 @@ def _known_formats(formats: list[str]) -> list[str]:
         if name not in FORMATS:
             raise unknown_name("figure format", name, FORMATS)
     return formats
+
+
+def _known_device(device: str) -> str:
+    """Return the name as given. Raises InputError for an unknown device."""
+    if not _DEVICE.fullmatch(device):
+        meant = suggestion("cuda" if device.startswith("gpu") else device, DEVICES)
+        raise InputError(f"--device takes {listed([*DEVICES, 'cuda:N'])}, not '{shortened(device, 60)}'; {meant}")
+    return device
 
 
 def known_statistic(stat: str | None) -> str | None:
@@ -63,39 +69,111 @@ Output = Annotated[
 # Which runs
 RunIds = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[RUN]...", help="Ids or their first digits; all runs when none is given."),
+    typer.Argument(
+        metavar="RUN",
+        help="Ids or their first digits; all runs when none is given.",
+        autocompletion=completion.run_ids,
+    ),
 ]
-Method = Annotated[str | None, typer.Option("--method", help="Only runs of this method.")]
-Environment = Annotated[str | None, typer.Option("--env", help="Only runs on this environment.")]
-Profile = Annotated[str | None, typer.Option("--profile", help="Only runs of this profile.")]
+RunId = Annotated[
+    str,
+    typer.Argument(metavar="RUN", help="The id of a run, or its first digits.", autocompletion=completion.run_ids),
+]
+METHOD_NAMES, ENVIRONMENT_NAMES = listed(METHODS), listed(ENVIRONMENTS)
+PROFILE_NAMES = "smoke, quick, paper, or one of your experiments.yaml"
+Method = Annotated[
+    str | None,
+    typer.Option(
+        "--method",
+        metavar="METHOD",
+        help=f"Only runs of this method: {METHOD_NAMES}.",
+        autocompletion=completion.methods,
+    ),
+]
+Environment = Annotated[
+    str | None,
+    typer.Option(
+        "--env",
+        metavar="ENV",
+        help=f"Only runs on this environment: {ENVIRONMENT_NAMES}.",
+        autocompletion=completion.environments,
+    ),
+]
+Profile = Annotated[
+    str | None,
+    typer.Option(
+        "--profile",
+        metavar="PROFILE",
+        help=f"Only runs of this profile: {PROFILE_NAMES}.",
+        autocompletion=completion.profiles,
+    ),
+]
 FigureProfile = Annotated[
     str | None,
-    typer.Option("--profile", help="Only runs of this profile.", show_default="the one that each figure draws"),
+    typer.Option(
+        "--profile",
+        metavar="PROFILE",
+        help=f"Only runs of this profile: {PROFILE_NAMES}.",
+        show_default="the one that each figure draws",
+        autocompletion=completion.profiles,
+    ),
 ]
 State = Annotated[
     str | None,
     typer.Option(
-        "--state", help="Only runs in this state: queued, running, finished, failed, diverged or interrupted."
+        "--state",
+        metavar="STATE",
+        help=f"Only runs in this state: {listed(STATES)}.",
+        autocompletion=lambda: list(STATES),
     ),
 ]
-Figure = Annotated[str | None, typer.Option("--figure", help="Only runs that this figure of the paper needs: fig5.")]
+FIGURE_NAMES = listed(f"{figure.name} ({figure.alias})" for figure in dict.fromkeys(FIGURES.values()))
+Figure = Annotated[
+    str | None,
+    typer.Option(
+        "--figure",
+        metavar="FIGURE",
+        help=f"Only runs that this figure of the paper needs: {FIGURE_NAMES}.",
+        autocompletion=completion.figures,
+    ),
+]
 
 # Training
-SEEDS_HELP = "Seeds, one run each: 0-4, or 0,2,5, or 0-2,7."
+SEEDS_HELP = "Seeds, one run each: 0-4 for five of them, 0,2,5 or 0-2,7; a single number is one seed, not a count."
 TrainingProfile = Annotated[
-    str, typer.Option("--profile", help="smoke (seconds), quick (minutes) or paper (the paper's scale).")
+    str,
+    typer.Option(
+        "--profile",
+        metavar="PROFILE",
+        help="smoke (seconds), quick (minutes), paper (the paper's scale: hours), or one of your experiments.yaml.",
+        autocompletion=completion.profiles,
+    ),
 ]
-Seeds = Annotated[str, typer.Option("--seeds", help=SEEDS_HELP)]
+Seeds = Annotated[str, typer.Option("--seeds", metavar="SEEDS", help=SEEDS_HELP)]
 Jobs = Annotated[int, typer.Option("--jobs", "-j", min=1, help="Runs to compute at once, one process each.")]
 Settings = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Replace a value of the spec: sac.gamma=0.9; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Replace a value of the spec: sac.gamma=0.9; repeatable.",
+        autocompletion=completion.settings,
+    ),
 ]
 ResumeOption = Annotated[
     Resume,
     typer.Option("--resume", help="Continue an unfinished run: if there is one, never, or fail without one."),
 ]
-DeviceOption = Annotated[Device, typer.Option("--device", help="auto takes a GPU when there is one.")]
+DeviceOption = Annotated[
+    str,
+    typer.Option(
+        "--device",
+        metavar="DEVICE",
+        callback=_known_device,
+        help="auto (a GPU when there is one), cpu, cuda, or cuda:1 for the second GPU.",
+        autocompletion=lambda: list(DEVICES),
+    ),
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would run, and train nothing.")]
 
 # Drawing
@@ -119,6 +197,11 @@ StatOfFigures = Annotated[
         show_default="mean-std",
     ),
 ]
+
+
+def named(words: list[str] | None, option: str | None) -> list[str]:
+    """Return the names that are given as arguments, and with commas between them as the value of an option."""
+    return [*(words or ()), *([part.strip() for part in option.split(",")] if option is not None else ())]
 
 
 def is_missing(database: str) -> bool:
@@ -209,17 +292,20 @@ def _too_many(text: str) -> InputError:
     return InputError(f"--seeds {shown} is more than {MOST_SEEDS} seeds or a seed above 2147483647; give less.")
 
 
-def pick_device(choice: Device) -> str:
-    """Return "cpu" or "cuda". Raises InputError for cuda without a GPU."""
-    if choice is Device.CPU:
-        return "cpu"
+def pick_device(choice: str) -> str:
+    """Return "cpu", "cuda" or "cuda:1". Raises InputError for a GPU that there is not."""
+    if choice == "cpu":
+        return choice
     import torch
 
-    if torch.cuda.is_available():
-        return "cuda"
-    if choice is Device.CUDA:
-        raise InputError("--device cuda needs a CUDA GPU, and none is found; use --device cpu.")
-    return "cpu"
+    number = int(choice.partition(":")[2] or 0)
+    found = torch.cuda.device_count()
+    if number < found:
+        return "cuda" if choice == AUTO else choice
+    if choice == AUTO:
+        return "cpu"
+    there = f"only {', '.join(f'cuda:{index}' for index in range(found))} found" if found else "none is found"
+    raise InputError(f"--device {choice} needs a CUDA GPU, and {there}; use --device {'cuda:0' if found else 'cpu'}.")
 
 
 def parse_statistic(stat: str | None) -> "Statistic | None":

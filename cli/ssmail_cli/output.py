@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+WIDEST = 120  # columns of running text, however wide the terminal is
 LONGEST_CELL = 4000  # characters in a table; a traceback has fewer
 Row = Mapping[str, Any]
 
@@ -141,20 +142,28 @@ def short(value: Any, digits: int = 4) -> str:
     return shortened(str(value), LONGEST_CELL)
 
 
-def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
-    """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits."""
+def print_table(rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence[str] = ()) -> None:
+    """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits.
+
+    If that is not enough, the columns of `spare` are left out, the first ones first, and a line says so.
+    """
     from rich.console import Console
     from rich.measure import Measurement
 
     console = Console()
     unlimited = console.options.update(max_width=10_000)
-    for gap, digits in ((2, 4), (1, 4), (1, 3)):
-        table = _table(rows, columns, gap, digits)
+    narrower = [(2, 4, ()), (1, 4, ()), *((1, 3, spare[:count]) for count in range(len(spare) + 1))]
+    for gap, digits, without in narrower:
+        shown = {key: heading for key, heading in columns.items() if key not in without}
+        table = _table(rows, shown, gap, digits)
         if Measurement.get(console, unlimited, table).maximum <= console.width:
             break
     with console.capture() as capture:
         console.print(table)
     sys.stdout.write(capture.get())
+    if len(shown) < len(columns):
+        left_out = [heading.replace("\n", " ") for key, heading in columns.items() if key not in shown]
+        say(f"left out, as the terminal is narrow: {', '.join(left_out)}")
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":

@@ -10,7 +10,7 @@ from typer.core import TyperCommand
 
 from ssmail.errors import ExitCode, InputError, stored_values, unknown_name
 from ssmail.paper.results import FIGURES
-from ssmail_cli import options
+from ssmail_cli import completion, options
 from ssmail_cli.figure_group import ALL, FigureGroup
 from ssmail_cli.options import open_store, parse_statistic
 from ssmail_cli.output import note, say
@@ -73,6 +73,7 @@ FigureRuns = Annotated[
         "--runs",
         metavar="RUN[,RUN...]",
         callback=_split_ids,
+        autocompletion=completion.run_ids,
         help="Draw these runs (ids or their first digits); repeatable.",
         show_default="those of experiments.yaml, else the spec with the most seeds",
     ),
@@ -83,12 +84,27 @@ OnlyRuns = Annotated[
         "--runs",
         metavar="RUN[,RUN...]",
         callback=_split_ids,
+        autocompletion=completion.run_ids,
         help="Only these runs (ids or their first digits); repeatable.",
     ),
 ]
-Methods = Annotated[list[str] | None, typer.Option("--method", help="Only runs of this method; repeatable.")]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--method",
+        metavar="METHOD",
+        help=f"Only runs of this method: {options.METHOD_NAMES}; repeatable.",
+        autocompletion=completion.methods,
+    ),
+]
 OneRun = Annotated[
-    str, typer.Option("--run", metavar="RUN", help="Id of the run or its first digits; see `ssmail runs list`.")
+    str,
+    typer.Option(
+        "--run",
+        metavar="RUN",
+        help="Id of the run or its first digits; see `ssmail runs list`.",
+        autocompletion=completion.run_ids,
+    ),
 ]
 
 
@@ -114,7 +130,14 @@ class FigureCommand(TyperCommand):
 def figure(
     ctx: typer.Context,
     environment: Annotated[
-        str | None, typer.Option("--env", help="Draw the runs on this environment.", show_default="the paper's")
+        str | None,
+        typer.Option(
+            "--env",
+            metavar="ENV",
+            help=f"Draw the runs on this environment: {options.ENVIRONMENT_NAMES}.",
+            show_default="the paper's",
+            autocompletion=completion.environments,
+        ),
     ] = None,
     runs: FigureRuns = None,
     profile: options.Profile = None,
@@ -154,7 +177,9 @@ def training(
         list[str] | None,
         typer.Option(
             "--metric",
-            help="Draw this metric; repeatable.",
+            metavar="METRIC",
+            help="Draw this metric, which `ssmail runs show RUN` lists; repeatable.",
+            autocompletion=completion.metrics,
             show_default="; ".join(f"{shown.curve} of {name}" for name, shown in ENVIRONMENT_METRICS.items()),
         ),
     ] = None,

@@ -1,16 +1,19 @@
 """Progress of a sweep on stderr: live lines on a terminal, a few log lines elsewhere."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import timedelta
 from typing import TYPE_CHECKING, Any
 
 from ssmail.errors import printable
+from ssmail.plots.formatting import duration
 from ssmail_cli.output import note, progress_console, short
 from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress, ProgressColumn, TaskID
 
     from ssmail.execution.cells import Cell, Event
 
@@ -23,6 +26,7 @@ LABELS = dict.fromkeys((metrics.validation for metrics in ENVIRONMENT_METRICS.va
     "actor/loss": "actor",
     "cloning/loss": "loss",
 }
+LONG = 60.0  # seconds; what is left of a run that takes longer stands in its log
 LOG_LINES = 10  # epochs that are logged of one run
 FEW = 10  # up to this many runs, each has a line from the beginning and a log of its epochs
 
@@ -39,37 +43,83 @@ def reporter(sweep: Sweep) -> Iterator[Report]:
     if not sys.stderr.isatty():
         yield _Log(labels)
         return
+    note(_legend(sweep))
     with _progress() as progress:
         yield _LinePerRun(progress, labels) if len(labels) <= FEW else _RunningRuns(progress, labels)
 
 
+def _legend(sweep: Sweep) -> str:
+    """Return what the columns of the live lines mean."""
+    if not any(cell.spec.epochs for cell in sweep):
+        return "columns: run, what it does, time it took"
+    errors = dict.fromkeys(environment_metrics(cell.spec.environment).validation for cell in sweep)
+    return f"columns: run, epochs done, val ({' or '.join(errors)}) and losses in training, time left"
+
+
 class _Log:
-    """Plain lines: the start and end of each run, and about LOG_LINES of its epochs if there are at most FEW runs."""
+    """Plain lines: the start and end of each run, and about LOG_LINES of its epochs if there are at most FEW runs.
+
+    Of a run that takes long the first epoch is logged too, and how much time is left.
+    """
 
     def __init__(self, labels: "Mapping[Cell, str]") -> None:
         self._labels, self._ended = labels, 0
+        self._began: dict[Cell, tuple[float, int]] = {}  # seconds and epoch at which the run started here
 
     def __call__(self, event: "Event") -> None:
         name, few = self._labels[event.cell], len(self._labels) <= FEW
+        if event.kind == "loading":
+            return
+        if event.kind in ("started", "resumed"):
+            self._began[event.cell] = time.monotonic(), event.epoch
         if event.kind != "epoch":
             self._ended += event.is_final
             count = f"  [{self._ended}/{len(self._labels)}]" if event.is_final and not few else ""
             note(f"{name}: {_headline(event)}{count}")
-        elif few and (event.epoch % max(1, event.epochs // LOG_LINES) == 0 or event.epoch == event.epochs):
-            note(f"{name}: epoch {event.epoch}/{event.epochs}  {_losses(event)}")
+            return
+        left = self._seconds_left(event)
+        is_first = event.epoch == self._began[event.cell][1] + 1 and left > LONG
+        is_due = event.epoch % max(1, event.epochs // LOG_LINES) == 0 or event.epoch == event.epochs
+        if is_first or (few and is_due):
+            remark = f"  about {duration(left)} left" if left > LONG else ""
+            note(f"{name}: epoch {event.epoch}/{event.epochs}  {_losses(event)}{remark}")
+
+    def _seconds_left(self, event: "Event") -> float:
+        """Estimate the time that the run still takes, from the epochs computed here."""
+        seconds, before = self._began[event.cell]
+        return (time.monotonic() - seconds) / (event.epoch - before) * (event.epochs - event.epoch)
 
 
 def _progress() -> "Progress":
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn
 
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=12),
         TextColumn("{task.completed:.0f}/{task.total:.0f}"),
         TextColumn("{task.fields[status]}", markup=False),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        _time_column(),
     )
-    return Progress(*columns, console=progress_console(), speed_estimate_period=120)
+    return Progress(*columns, console=progress_console())
+
+
+def _time_column() -> "ProgressColumn":
+    """Return a column of the time left, estimated from the first epoch on, or the time that an ended run took."""
+    from rich.progress import ProgressColumn, Task
+    from rich.text import Text
+
+    class Time(ProgressColumn):
+        max_refresh = 0.5
+
+        def render(self, task: Task) -> Text:
+            done = task.completed - task.fields.get("before", 0)
+            if task.elapsed and (task.stop_time is not None or task.finished):
+                return Text(str(timedelta(seconds=int(task.elapsed))))
+            if task.elapsed and done > 0:
+                return Text(f"{duration(task.elapsed / done * (task.remaining or 0.0))} left")
+            return Text("")
+
+    return Time()
 
 
 class _LinePerRun:
@@ -106,9 +156,10 @@ class _RunningRuns:
         elif event.is_final:
             self._end(event)
         else:
-            task = self._progress.add_task(self._labels[event.cell], total=event.epochs, status="")
-            self._tasks[event.cell] = task
-            _update(self._progress, task, event)
+            if event.cell not in self._tasks:
+                task = self._progress.add_task(self._labels[event.cell], total=event.epochs, start=False, status="")
+                self._tasks[event.cell] = task
+            _update(self._progress, self._tasks[event.cell], event)
             self._subtract(event.epoch)
 
     def _end(self, event: "Event") -> None:
@@ -129,8 +180,10 @@ class _RunningRuns:
 
 
 def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
-    if event.kind in ("started", "resumed"):
-        progress.reset(task, completed=event.epoch, status=_headline(event))
+    if event.kind == "loading":
+        progress.update(task, status="loading")
+    elif event.kind in ("started", "resumed"):
+        progress.reset(task, completed=event.epoch, status=_headline(event), before=event.epoch)
     elif event.kind == "epoch":
         progress.update(task, completed=event.epoch, status=_losses(event))
     else:

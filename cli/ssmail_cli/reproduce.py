@@ -12,9 +12,9 @@ from ssmail.errors import ExitCode, InputError, command_line, unknown_name
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
-from ssmail_cli import options
+from ssmail_cli import completion, options
 from ssmail_cli.datasets import prep_mocap
-from ssmail_cli.options import Device, is_missing, parse_seeds
+from ssmail_cli.options import is_missing, parse_seeds
 from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
@@ -30,12 +30,21 @@ if TYPE_CHECKING:
 SEEDS, FEWER_SEEDS = "0-4", {"smoke": "0-1"}  # with which a smoke ends within five minutes on two cores
 PLAN_COLUMNS = {"figure": "figure", "runs": "runs", "stored": "stored", "new": "new", "time": "time"}
 
+Figures = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="FIGURE",
+        help=f"Only these figures, and no report: {options.FIGURE_NAMES}.",
+        autocompletion=completion.figures,
+    ),
+]
 Only = Annotated[
     str | None,
-    typer.Option("--only", metavar="FIGURE[,FIGURE...]", help="Only these figures, no report.", show_default="all"),
+    typer.Option("--only", metavar="FIGURE[,FIGURE...]", help="The same, with commas between.", show_default="all"),
 ]
 SeedsOfProfile = Annotated[
-    str | None, typer.Option("--seeds", help=options.SEEDS_HELP, show_default="0-4; with --profile smoke 0-1")
+    str | None,
+    typer.Option("--seeds", metavar="SEEDS", help=options.SEEDS_HELP, show_default="0-4; with --profile smoke 0-1"),
 ]
 CmuDir = Annotated[
     Path | None,
@@ -49,11 +58,12 @@ DryRun = Annotated[bool, typer.Option("--dry-run", help="Print how many runs wou
 
 
 def reproduce(
+    names: Figures = None,
     only: Only = None,
     profile: options.TrainingProfile = "quick",
     seeds: SeedsOfProfile = None,
     jobs: options.Jobs = 2,
-    device: options.DeviceOption = Device.AUTO,
+    device: options.DeviceOption = options.AUTO,
     cmu: CmuDir = None,
     dry_run: DryRun = False,
     as_json: options.Json = False,
@@ -66,17 +76,18 @@ def reproduce(
 
     Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: after Ctrl-C or a kill,
     the same command continues. A run that fails stops neither the others nor the figures. report.md and report.html go
-    beside the folder of the figures; with --only there is no report, and `ssmail report` writes one of all that is
-    stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the paths of
-    the files. Exit code 3: some runs did not finish, or figures were left out.
+    beside the folder of the figures; where figures are named there is no report, and `ssmail report` writes one of all
+    that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
+    paths of the files. Exit code 3: some runs did not finish, or figures were left out.
     """
     seeds = seeds if seeds is not None else FEWER_SEEDS.get(profile, SEEDS)
-    figures = _figures(only, profile, parse_seeds(seeds))
+    wanted = options.named(names, only)
+    figures = _figures(wanted, profile, parse_seeds(seeds))
     statistic = options.parse_statistic(stat)
     if statistic and not any(FIGURES[name].has_statistic for name in figures):
         raise InputError(f"{', '.join(figures)} shows no centre and band; leave --stat out.")
     data = _find_data(figures, cmu)
-    if only is not None and set(data.missing) == set(figures):
+    if wanted and set(data.missing) == set(figures):
         raise InputError(f"{next(iter(data.missing.values()))}.")
     data.tell()
     if dry_run:
@@ -90,7 +101,7 @@ def reproduce(
     ]
     command = command_line("ssmail", "reproduce", "--profile", profile, "--seeds", seeds, "--db", db)
     failed = any(figure.lacks for figure in drawn if figure.name not in data.missing)
-    if only is None:
+    if not wanted:
         try:
             write_report(store, drawn, out, command, profile, unfinished(sweep, rows))
         except (BrokenPipeError, OutputError):
@@ -105,13 +116,13 @@ def reproduce(
         raise typer.Exit(ExitCode.SOME_RUNS_FAILED)
 
 
-def _figures(only: str | None, profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
-    """Return the cells of each figure asked for, by its name in the paper."""
+def _figures(names: Sequence[str], profile: str, seeds: Sequence[int]) -> dict[str, Sweep]:
+    """Return the cells of each figure asked for, or of all of them, by its name in the paper."""
     from ssmail.config.experiments_file import load_experiments
 
     listed = load_experiments().figures
     choices = {key: figure.name for key, figure in FIGURES.items() if figure.name in listed}
-    wanted = [part.strip() for part in only.split(",")] if only is not None else list(choices)
+    wanted = names or list(choices)
     for name in wanted:
         if name not in choices:
             raise unknown_name("figure", name, choices)

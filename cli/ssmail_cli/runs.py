@@ -9,7 +9,8 @@ import typer
 
 from ssmail.errors import ExitCode, InputError, printable, unknown_name
 from ssmail.plots.formatting import counted
-from ssmail_cli import options
+from ssmail_cli import completion, options
+from ssmail_cli.command_group import Commands
 from ssmail_cli.output import (
     Format,
     chosen_format,
@@ -22,7 +23,7 @@ from ssmail_cli.output import (
     write_csv,
     write_json,
 )
-from ssmail_cli.run_table import environment_metrics, rows_with_metrics, run_row
+from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics, rows_with_metrics, run_row
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -30,7 +31,18 @@ if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
     from ssmail.store.comparison import Comparison
 
-app = typer.Typer(help="List, show, compare, export and delete stored runs.", rich_markup_mode=None)
+
+class RunsGroup(Commands):
+    """`ssmail runs` alone lists the runs."""
+
+    ALONE = "list"
+
+
+app = typer.Typer(
+    cls=RunsGroup,
+    help="List, show, compare, export and delete stored runs; `ssmail runs` alone lists them.",
+    rich_markup_mode=None,
+)
 
 RUN_COLUMNS = {
     "run": "run",
@@ -81,7 +93,7 @@ def list_runs(
 
 @app.command()
 def show(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="The id of a run, or its first digits.")],
+    run: options.RunId,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
@@ -105,7 +117,15 @@ def compare(
     ids: options.RunIds = None,
     metrics: Annotated[
         list[str] | None,
-        typer.Option("--metric", help="Compare this metric; repeatable.", show_default="those of the environment"),
+        typer.Option(
+            "--metric",
+            metavar="METRIC",
+            help="Compare this metric, which `ssmail runs show RUN` lists; repeatable.",
+            show_default="; ".join(
+                f"{', '.join(shown.compared)} of {name}" for name, shown in ENVIRONMENT_METRICS.items()
+            ),
+            autocompletion=completion.metrics,
+        ),
     ] = None,
     method: options.Method = None,
     environment: options.Environment = None,
@@ -186,7 +206,10 @@ def export(
 
 @app.command()
 def delete(
-    ids: Annotated[list[str], typer.Argument(metavar="RUN...", help="Ids of runs, or their first digits.")],
+    ids: Annotated[
+        list[str],
+        typer.Argument(metavar="RUN", help="Ids of runs, or their first digits.", autocompletion=completion.run_ids),
+    ],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without asking.")] = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
@@ -242,7 +265,7 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
     """Yield the details as rows: section, name, step (of a metric), value."""
-    from ssmail.config.spec import flatten
+    from ssmail.config.names import flatten
 
     for section in ("run", "spec"):
         for name, value in flatten(details[section]).items():

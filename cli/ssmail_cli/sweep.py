@@ -3,19 +3,21 @@
 A sweep is a dictionary from each cell to what tells it from the others: {"beta": 0.15, "seed": 2}.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 from ssmail.errors import ExitCode, InputError, sentence
 from ssmail.execution import Resume
+from ssmail.plots.formatting import counted, duration, listed, spans
 from ssmail_cli.options import is_missing, noting_damage
-from ssmail_cli.output import chosen_format, note, print_rows
+from ssmail_cli.output import Format, chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.run_table import key_metrics, rows_with_metrics
 
 if TYPE_CHECKING:
+    from ssmail.config.spec import RunSpec
     from ssmail.execution.cells import Cell, Event
     from ssmail.store import Store
 
@@ -29,9 +31,66 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, a
 
     check_labels(sweep)  # before there is a database
     store = noting_damage(Store.open(db))
+    announce(store, sweep, jobs, resume)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
-    print_rows(rows, {**_name_columns(sweep), **_result_columns(sweep)}, chosen_format(as_json, None))
+    print_results(rows, sweep, chosen_format(as_json, None))
     return rows
+
+
+def announce(store: "Store", sweep: Sweep, jobs: int, resume: Resume) -> None:
+    """Print on stderr what a sweep will compute: a line for all of its runs, and one for each of several specs.
+
+    The time is estimated from the stored runs; where only smaller ones are stored, as the least that it takes.
+    """
+    from ssmail.execution.planning import estimated_seconds, least_seconds, total_seconds
+
+    of_spec: dict[RunSpec, list[Cell]] = {}
+    for cell in sweep:
+        of_spec.setdefault(cell.spec, []).append(cell)
+    finished = store.runs(state="finished")
+    seconds = estimated_seconds(finished, list(of_spec))
+    least = {spec: least_seconds(finished, spec) for spec, known in seconds.items() if known is None}
+    new = [cell for cell in sweep if resume is Resume.NEVER or not _is_settled(store, cell)]
+
+    def work(cells: "Collection[Cell]") -> str:
+        ahead = [cell for cell in new if cell in cells]
+        parts = [f"{len(cells) - len(ahead)} stored, {len(ahead)} to train"] if len(ahead) < len(cells) else []
+        known = [each for cell in ahead if (each := seconds[cell.spec] or least.get(cell.spec)) is not None]
+        if known:
+            is_whole = len(known) == len(ahead) and not any(cell.spec in least for cell in ahead)
+            parts.append(f"{'about' if is_whole else 'more than'} {duration(total_seconds(known, jobs))}")
+        return "".join(f"; {part}" for part in parts)
+
+    note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}{work(sweep)}")
+    for cells in of_spec.values() if len(of_spec) > 1 else ():
+        names = {key: value for key, value in sweep[cells[0]].items() if key != "seed"}
+        note(f"  {label(names)}: {counted(len(cells), 'run')}{work(cells)}")
+
+
+def _extent(sweep: Sweep) -> str:
+    """Return what the runs have in common, and their seeds; of a single one, how several are given."""
+    seeds = list(dict.fromkeys(cell.seed for cell in sweep))
+    method, environment, profile = (
+        listed(dict.fromkeys(getattr(cell.spec, name) for cell in sweep), "and")
+        for name in ("method", "environment", "profile")
+    )
+    what = f"{method} on {environment}, profile {profile}"
+    if len(seeds) > 1:
+        return f"{what}, {len(seeds)} seeds: {spans(seeds)}"
+    return f"{what}, 1 seed: {seeds[0]} (--seeds 0-4 for five)"
+
+
+def _is_settled(store: "Store", cell: "Cell") -> bool:
+    row = store.find_cell(cell.spec.hash(), cell.seed)
+    return row is not None and row.state.settled
+
+
+def print_results(rows: Rows, sweep: Sweep, form: Format) -> None:
+    """Print a row for each cell. A table and CSV have the columns that matter, JSON has all."""
+    columns = {**_name_columns(sweep), **_result_columns(sweep)}
+    if form is Format.CSV:
+        rows = [{key: row.get(key) for key in columns} for row in rows]
+    print_rows(rows, columns, form)
 
 
 def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str) -> "list[Event]":
@@ -95,6 +154,7 @@ def print_plan(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
         {**names, "action": action, "run": run and run[:8], "spec_hash": cell.spec.hash()}
         for (cell, names), (action, run) in zip(sweep.items(), actions.values(), strict=True)
     ]
+    note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}")
     columns = {**_name_columns(sweep), "action": "would", "run": "run", "spec_hash": "spec"}
     print_rows(rows, columns, chosen_format(as_json, None))
 

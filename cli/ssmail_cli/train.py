@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import fields
+from itertools import product
 from typing import Annotated, Any
 
 import typer
@@ -10,35 +11,66 @@ from typer.core import TyperCommand
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
-from ssmail_cli import options
-from ssmail_cli.options import Device, parse_seeds, pick_device
+from ssmail_cli import completion, options
+from ssmail_cli.options import parse_seeds, pick_device
 from ssmail_cli.output import note
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
 
 
 def train(
-    method: Annotated[str, typer.Option("--method", help="The method to train.")] = "ssail",
-    environment: Annotated[str, typer.Option("--env", help="The environment to train on.")] = "yjunction",
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="METHOD", help="The methods to train, as with --method.", autocompletion=completion.methods
+        ),
+    ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method",
+            metavar="METHOD",
+            help=f"The method to train: {options.METHOD_NAMES}; repeatable.",
+            show_default="ssail",
+            autocompletion=completion.methods,
+        ),
+    ] = None,
+    environments: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--env",
+            metavar="ENV",
+            help=f"The environment to train on: {options.ENVIRONMENT_NAMES}; repeatable.",
+            show_default="yjunction",
+            autocompletion=completion.environments,
+        ),
+    ] = None,
     profile: options.TrainingProfile = "quick",
     seeds: options.Seeds = "0",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
-    device: options.DeviceOption = Device.AUTO,
+    device: options.DeviceOption = options.AUTO,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Train a method with one or several seeds.
+    """Train methods with one or several seeds.
 
-    A spec and a seed make a run: finished runs are skipped, unfinished ones resumed. Ctrl-C saves and stops.
+    A spec and a seed make a run: finished runs are skipped, unfinished ones resumed. Several methods or environments
+    make one sweep, whose specs are all checked before the first run begins. Ctrl-C saves and stops.
     """
     from ssmail.config.experiments import build_spec
     from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
-    spec = build_spec(method, environment, profile, settings or [])
-    sweep = {Cell(spec, seed): {"seed": seed} for seed in chosen_seeds}
+    chosen = list(dict.fromkeys([*(names or ()), *(methods or ())])) or ["ssail"]
+    places = list(dict.fromkeys(environments or ())) or ["yjunction"]
+    sweep: dict[Cell, dict[str, Any]] = {}
+    for environment, method in product(places, chosen):
+        spec = build_spec(method, environment, profile, settings or [])
+        labels = {"method": method} if len(chosen) > 1 else {}
+        labels |= {"environment": environment} if len(places) > 1 else {}
+        sweep |= {Cell(spec, seed): {**labels, "seed": seed} for seed in chosen_seeds}
     if dry_run:
         print_plan(sweep, db, resume, as_json)
         return
@@ -47,7 +79,12 @@ def train(
 
 def ablate(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="alpha, beta, curriculum or label, or one of your experiments.yaml.")
+        str,
+        typer.Argument(
+            metavar="NAME",
+            help="alpha, beta, curriculum or label, or one of your experiments.yaml.",
+            autocompletion=completion.ablations,
+        ),
     ],
     values: Annotated[
         str | None,
@@ -59,14 +96,20 @@ def ablate(
     ] = None,
     environment: Annotated[
         str | None,
-        typer.Option("--env", help="Train on this environment.", show_default="the ablation's in experiments.yaml"),
+        typer.Option(
+            "--env",
+            metavar="ENV",
+            help=f"Train on this environment: {options.ENVIRONMENT_NAMES}.",
+            show_default="the ablation's in experiments.yaml",
+            autocompletion=completion.environments,
+        ),
     ] = None,
     profile: options.TrainingProfile = "quick",
     seeds: options.Seeds = "0-4",
     jobs: options.Jobs = 1,
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
-    device: options.DeviceOption = Device.AUTO,
+    device: options.DeviceOption = options.AUTO,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
     db: options.Database = options.DEFAULT_DATABASE,

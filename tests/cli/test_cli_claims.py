@@ -60,13 +60,44 @@ def test_csv_has_a_row_for_each_part(cli: CommandLine, beta: Path) -> None:
     assert "C3: missing of curriculum.beta" in found.err
 
 
-def test_the_text_tells_the_verdict_every_seed_and_what_is_missing(cli: CommandLine, beta: Path) -> None:
-    text = " ".join(cli("claims", "--format", "table", "--db", beta).out.split())
+def test_the_text_is_a_table_of_verdicts(cli: CommandLine, beta: Path) -> None:
+    found = cli("claims", "--format", "table", "--db", beta)
+    lines = found.out.splitlines()
+    assert [line.split()[0] for line in lines[1:9]] == [f"C{number}" for number in range(1, 9)]
+    assert " ".join(lines[1].split()) == "C1 stability smoke inconclusive 1 inconclusive 1 runs missing"
+    assert "seed by seed" not in found.out
+    assert f"`ssmail claims C4 --db {beta}` shows what" in " ".join(found.out.split())
+    assert found.err == ""  # which runs were chosen is told with the details
+
+
+@pytest.mark.parametrize("named", [("C1", "c3", "alpha"), ("--only", "C1,beta,alpha"), ("C1", "--only", "C3,C5")])
+def test_named_claims_are_told_with_every_seed_and_what_is_missing(
+    cli: CommandLine, beta: Path, named: tuple[str, ...]
+) -> None:
+    found = cli("claims", *named, "--format", "table", "--db", beta)
+    assert [line.split()[0] for line in found.out.splitlines()[1:4]] == ["C1", "C3", "C5"]
+    text = " ".join(found.out.split())
     assert "C3 beta (section 4.5, fig6): supported" in text
     assert "beta 0.15, seed by seed: 0: 0.002, 1: 0.0021, 2: 0.0022, 3: 0.0023, 4: 0.0024" in text
     assert "gail does not converge: inconclusive, no runs of gail" in text
-    assert "C1 stability smoke inconclusive 1 inconclusive 1 runs missing" in text
     assert "next: ssmail reproduce --only fig8 --profile quick --seeds 0-4" in text
+    assert "C3: missing of curriculum.beta" in found.err
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120])
+def test_no_word_is_broken_and_no_line_is_too_long(
+    cli: CommandLine, beta: Path, monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    names = [f"C{number}" for number in range(1, 9)]
+    monkeypatch.setenv("COLUMNS", "400")
+    words = set(cli("claims", *names, "--format", "table", "--db", beta).out.split())
+    monkeypatch.setenv("COLUMNS", str(width))
+    lines = cli("claims", *names, "--format", "table", "--db", beta).out.splitlines()
+    assert max(map(len, lines)) <= width
+    notice = [line for line in lines if line.startswith("left out, as the terminal is narrow: ")]
+    assert len(notice) == (width < 76)
+    shown = {word for line in lines if line not in notice for word in line.split()}
+    assert {word for word in shown - words if not word[0].isdigit()} == set()  # numbers have fewer digits
 
 
 def test_another_profile_has_no_runs(cli: CommandLine, beta: Path) -> None:

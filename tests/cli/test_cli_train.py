@@ -9,10 +9,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from ssmail.config.experiments import build_spec
 from ssmail.errors import InputError
 from ssmail.execution import Resume, local
+from ssmail.execution.cells import Cell, Event
 from ssmail.store import Store
-from ssmail_cli.options import MOST_SEEDS, parse_seeds
+from ssmail_cli import progress
+from ssmail_cli.options import MOST_SEEDS, parse_seeds, pick_device
 from tests.cli.command_line import CommandLine, FakeTraining
 
 SMOKE = ("train", "--profile", "smoke", "--device", "cpu")
@@ -148,10 +151,28 @@ def test_results_on_mocap_have_its_own_columns(
 def test_without_a_terminal_progress_is_a_few_lines(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
     lines = cli(*SMOKE, "--set", "training.epochs=100", "--db", db).err.splitlines()
-    assert lines[0].startswith("seed 0: started (run ")
-    assert lines[1] == "seed 0: epoch 10/100  val 0.01  critic 0.5"
+    assert lines[0].startswith("1 run: ssail on yjunction, profile smoke, 1 seed: 0")
+    assert lines[1].startswith("seed 0: started (run ")
+    assert lines[2] == "seed 0: epoch 10/100  val 0.01  critic 0.5"
     assert lines[-1].startswith("seed 0: finished (run ")
-    assert len(lines) == 12
+    assert len(lines) == 13
+
+
+def test_the_log_of_a_long_run_says_how_much_is_left(capsys: pytest.CaptureFixture[str]) -> None:
+    """100 epochs of 30 s after a start at epoch 10, on a clock of the test's own."""
+    cell = Cell(build_spec("ssail", "yjunction", "smoke", ["training.epochs=110"]), 0)
+    clock = iter([0.0, *(30.0 * epoch for epoch in range(1, 101))])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress.time, "monotonic", lambda: next(clock))
+        with progress.reporter({cell: {"seed": 0}}) as report:
+            report(Event("loading", cell, None, 0, 110))
+            report(Event("resumed", cell, "a" * 32, 10, 110))
+            for epoch in range(11, 111):
+                report(Event("epoch", cell, "a" * 32, epoch, 110, {"critic/loss": 0.5}))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[1] == "seed 0: epoch 11/110  critic 0.5  about 50 min left"
+    assert lines[2] == "seed 0: epoch 22/110  critic 0.5  about 44 min left"
+    assert lines[-1] == "seed 0: epoch 110/110  critic 0.5"
 
 
 def test_on_a_terminal_there_is_a_line_for_each_seed(
@@ -162,6 +183,7 @@ def test_on_a_terminal_there_is_a_line_for_each_seed(
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     outcome = cli(*SMOKE, "--seeds", "0-1", "--db", db)
     assert outcome.code == 3
+    assert outcome.err.splitlines()[1].startswith("columns: run, epochs done, val (validation/mode_mse) and losses")
     assert "seed 0 " in outcome.err
     assert "3/3 finished (run " in outcome.err
     assert "3/3 failed (run " in outcome.err
@@ -216,13 +238,25 @@ def test_nothing_to_resume(cli: CommandLine, db: Path, options: list[str]) -> No
 def test_cuda_without_a_gpu(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     sentence = cli("train", "--profile", "smoke", "--device", "cuda", "--db", db).sentence
     assert sentence == "--device cuda needs a CUDA GPU, and none is found; use --device cpu."
+    assert "--device cuda:1 needs a CUDA GPU, and none" in cli(*SMOKE[:-2], "--device", "cuda:1", "--db", db).sentence
     given = fake()
     assert cli("train", "--profile", "smoke", "--device", "auto", "--db", db).code == 0
     assert given["device"] == "cpu"
 
 
+def test_one_of_several_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 2)
+    assert [pick_device(name) for name in ("auto", "cpu", "cuda", "cuda:0", "cuda:1")] == [
+        "cuda", "cpu", "cuda", "cuda:0", "cuda:1",
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="only cuda:0, cuda:1 found; use --device cuda:0"):
+        pick_device("cuda:2")
+
+
 def test_a_data_file_that_does_not_exist(cli: CommandLine, db: Path, tmp_path: Path) -> None:
-    assert f"{tmp_path}/none.npz" in cli(*SMOKE, "--set", f"data.path={tmp_path}/none.npz", "--db", db).sentence
+    outcome = cli(*SMOKE, "--set", f"data.path={tmp_path}/none.npz", "--db", db)
+    assert outcome.code == 2
+    assert f"{tmp_path}/none.npz" in outcome.err.splitlines()[-1]
 
 
 def test_a_real_training_from_the_command_line_to_the_figure(cli: CommandLine, db: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.spec import ENVIRONMENTS
+from ssmail.config.names import ENVIRONMENTS
 from ssmail.data import expert_sets
 from ssmail.training.loop import TrainingLoop
 from ssmail_cli.progress import LABELS

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from ssmail.config.experiments import ablation, ablation_specs, build_spec, display_value, to_tuples
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError
 
 from .experiments_file import SHIPPED, write

@@ -6,7 +6,8 @@ import pytest
 
 from ssmail.config.experiments import ablation_specs, build_spec, display_value, figure_requirements
 from ssmail.config.experiments_file import load_experiments
-from ssmail.config.spec import ENVIRONMENTS, METHODS, RunSpec
+from ssmail.config.names import ENVIRONMENTS, METHODS
+from ssmail.config.spec import RunSpec
 
 EXPERIMENTS = load_experiments()
 CELLS = list(itertools.product(EXPERIMENTS.methods, EXPERIMENTS.environments, EXPERIMENTS.profiles))

@@ -11,12 +11,11 @@ from pydantic import ValidationError
 
 from ssmail.config import spec as specs
 from ssmail.config.experiments import build_spec
+from ssmail.config.names import ENVIRONMENTS, METHODS
 from ssmail.config.shaping import read_label
 from ssmail.config.spec import (
     ENVIRONMENT_SECTIONS,
-    ENVIRONMENTS,
     METHOD_SECTIONS,
-    METHODS,
     OPTIONAL_SECTIONS,
     RunSpec,
     required_sections,

@@ -27,12 +27,13 @@ PARENT = Path(__file__).parent / "parent.py"
 def compute(
     store: Store, cells: Sequence[Cell], loop: type, meanwhile: Callable[[Event], None] = lambda _: None, **how: Any
 ) -> tuple[list[Event], list[Event]]:
-    """Final events, and all events."""
+    """Final events, and all events but those of processes that are loading."""
     events: list[Event] = []
 
     def on_event(event: Event) -> None:
-        events.append(event)
-        meanwhile(event)
+        if event.kind != "loading":
+            events.append(event)
+            meanwhile(event)
 
     final = run_cells(cells, store_url=store.url, on_event=on_event, worker=fake_worker(loop), **how)
     return final, events
@@ -73,6 +74,15 @@ def test_accidents_leave_other_cells_alone_and_can_be_resumed(store: Store, cell
     assert final[1].run_id == killed
     assert recorded(store, final[0].run_id) == undisturbed(cells[0], tmp_path)
     assert recorded(store, killed) == undisturbed(cells[2], tmp_path)
+
+
+def test_a_process_is_loading_until_its_run_begins(store: Store, cells: list[Cell]) -> None:
+    events: list[Event] = []
+    run_cells(cells[:1], store_url=store.url, on_event=events.append, worker=fake_worker(Walk))
+    assert [(event.kind, event.run_id is None) for event in events[:2]] == [("loading", True), ("started", False)]
+    events.clear()
+    run_cells(cells[:1], store_url=store.url, on_event=events.append, worker=fake_worker(Walk))
+    assert [event.kind for event in events] == ["skipped"]  # which needs no process
 
 
 def test_two_processes_at_once_of_one_thread_each_may_print_what_they_like(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.execution.cells import Cell
-from ssmail.execution.planning import estimated_seconds, longest_first, shares, total_seconds
+from ssmail.execution.planning import estimated_seconds, least_seconds, longest_first, shares, total_seconds
 from ssmail.store import RunRow, Store
 
 
@@ -48,6 +48,15 @@ def test_other_runs_of_the_method_are_scaled_by_their_updates(row: RunRow) -> No
     strangers = [took(row, ten.model_copy(update={"profile": "quick"}), 1.0), took(row, smoke(method="gail"), 1.0)]
     assert estimated_seconds([*runs, *strangers], [spec]) == {spec: 1800.0}
     assert estimated_seconds(strangers, [spec]) == {spec: None}
+
+
+def test_smaller_runs_of_another_profile_tell_the_least_time(row: RunRow) -> None:
+    large = build_spec("ssail", "yjunction", "paper", ["training.epochs=100", "training.updates=10"])  # 1000 updates
+    small = build_spec("ssail", "yjunction", "quick", ["training.epochs=10", "training.updates=10"])
+    assert least_seconds([took(row, small, 50.0)], large) == 500.0
+    assert estimated_seconds([took(row, small, 50.0)], [large]) == {large: None}
+    assert least_seconds([took(row, large, 900.0)], small) is None  # a larger network tells nothing
+    assert least_seconds([took(row, smoke(method="gail"), 1.0)], large) is None
 
 
 def test_references_take_no_updates(row: RunRow) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from ssmail.config.spec import METHODS
+from ssmail.config.names import METHODS
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.store import Store
 from ssmail.store.checkpoint_files import STAGING

@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ssmail.config.experiments_file import ENVIRONMENT_VARIABLE
-from ssmail.config.spec import ENVIRONMENTS, METHODS, RunSpec, _spec_keys
+from ssmail.config.names import ENVIRONMENTS, METHODS
+from ssmail.config.spec import RunSpec, _spec_keys
 from tests.config.experiments_file import write
 from tests.hostile.harness import cases, hold
 from tests.hostile.odd_values import TEXTS, WORDS

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from ssmail.config.experiments import ablation, ablation_specs
-from ssmail.config.spec import ENVIRONMENTS
+from ssmail.config.names import ENVIRONMENTS
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, median_quartiles
 from ssmail.paper import fig8_alpha

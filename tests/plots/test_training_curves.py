@@ -62,6 +62,21 @@ def test_the_newest_run_of_a_cell_that_has_the_metric_is_drawn(store: Store, add
     assert notes == (f"{ERROR}: 1 of the chosen runs have none.", "1 older run of the same spec and seed left out.")
 
 
+def test_a_compact_database_says_that_it_kept_one_value(store: Store, add_run: Any) -> None:
+    add_run(0, [0.3, 0.2, 0.1])
+    add_run(1, [0.3, 0.2, 0.1])
+    (whole,) = collect(store, store.runs()[:1], [LOSS]).notes or ("",)
+    assert "compact" not in whole
+    with closing(sqlite3.connect(store.where)) as connection, connection:
+        connection.execute("DELETE FROM metric WHERE name = ? AND step < 3", (LOSS,))
+    note = f"{LOSS}: of 2 runs the last value alone is stored, for {store.where} is compact: it keeps the curves that "
+    assert collect(store, store.runs(), [ERROR, LOSS]).notes == (f"{note}figures and claims read.",)
+    with closing(sqlite3.connect(store.where)) as connection, connection:
+        row = (store.runs()[0].id, "last", "x/last.pt", "0" * 64, 1)
+        connection.execute("INSERT INTO artifact (run_id, name, path, sha256, size_bytes) VALUES (?, ?, ?, ?, ?)", row)
+    assert f"{LOSS}: of 1 run the last value" in collect(store, store.runs(), [LOSS]).notes[0]  # a checkpoint is there
+
+
 def test_a_diverged_run_is_the_worst_in_errors_and_unknown_in_anything_else(store: Store, add_run: Any) -> None:
     for seed in range(2):
         add_run(seed, [0.1, 0.1, 0.1])

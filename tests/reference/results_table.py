@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.spec import METHODS
+from ssmail.config.names import METHODS
 from ssmail.store import Store
 from ssmail.store.comparison import Comparison, compare_runs
 

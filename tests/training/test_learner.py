@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssmail.config.spec import METHODS
+from ssmail.config.names import METHODS
 from ssmail.training.learner import Predictor
 from ssmail.training.loop import TrainingLoop
 from tests.training.conftest import ToySpec

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.spec import METHODS, RunSpec
+from ssmail.config.names import METHODS
+from ssmail.config.spec import RunSpec
 from ssmail.training.evaluators import LetterEvaluator
 from ssmail.training.loop import TrainingLoop
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.spec import METHODS, RunSpec
+from ssmail.config.names import METHODS
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError
 from ssmail.training.adversarial import AdversarialLearner, AdversarialTraining
 from ssmail.training.curricula import mean_segment_length

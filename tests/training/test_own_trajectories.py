@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ssmail.config.experiments import build_spec
-from ssmail.config.spec import METHODS, RunSpec
+from ssmail.config.names import METHODS
+from ssmail.config.spec import RunSpec
 from ssmail.data import expert_sets
 from ssmail.errors import InputError
 from ssmail.training.loop import TrainingLoop

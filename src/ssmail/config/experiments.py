@@ -15,16 +15,14 @@ from yaml.constructor import ConstructorError
 
 from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
+from ssmail.config.names import ENVIRONMENTS, METHODS, flatten
 from ssmail.config.spec import (
-    ENVIRONMENTS,
     GENERATED_ENVIRONMENTS,
-    METHODS,
     OPTIONAL_SECTIONS,
     RunSpec,
     check_keys,
     check_section,
     explain,
-    flatten,
     required_sections,
 )
 from ssmail.config.user_functions import UserFunction, search_folders

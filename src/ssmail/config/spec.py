@@ -9,17 +9,13 @@ import json
 import re
 from collections.abc import Mapping
 from itertools import chain
-from typing import Any, Literal, Self, get_args
+from typing import Any, Self, get_args
 
 from pydantic import BaseModel, ValidationError, model_validator
 
 from ssmail.config import sections, strict_yaml
+from ssmail.config.names import ENVIRONMENTS, METHODS, Environment, Method
 from ssmail.errors import InputError, shortened
-
-Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocity", "copy-last"]
-METHODS: tuple[str, ...] = get_args(Method)
-Environment = Literal["yjunction", "letters", "mocap", "trajectories"]
-ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 
 _ADVERSARIAL = ("model", "adversarial", "sac", "curriculum", "training")
 _VARIATIONAL = ("variational", "cloning", "curriculum", "training")
@@ -141,15 +137,6 @@ def with_added_keys(stored: Mapping[str, Any]) -> dict[str, Any]:
         if values.get(section) is not None:
             values[section] = {key: before, **values[section]}
     return values
-
-
-def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested values by dotted key: {"a": {"b": 1}} -> {"a.b": 1}. An empty mapping counts as a value."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        nested = isinstance(value, Mapping) and value
-        flat |= flatten(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": value}
-    return flat
 
 
 def check_keys(given: Mapping[str, Any], source: str) -> None:

@@ -9,7 +9,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.execution import Resume
 from ssmail.store import HEARTBEAT_SECONDS
 
-Kind = Literal["started", "resumed", "skipped", "epoch", "finished", "failed", "diverged", "interrupted"]
+Kind = Literal["loading", "started", "resumed", "skipped", "epoch", "finished", "failed", "diverged", "interrupted"]
 NO_LONGER_STORED = "its run is no longer in the database: it was deleted, or the database replaced, meanwhile"
 """What became of a run that ended well but is not stored."""
 _FINAL = ("skipped", "finished", "failed", "diverged", "interrupted")
@@ -27,8 +27,9 @@ class Cell:
 class Event:
     """Something that happened to a cell.
 
-    epoch: the number of completed epochs, out of `epochs`. metrics: those of the epoch, or of the final evaluation.
-    bad_input: the cell failed before its run started because of the user's input; `message` explains why.
+    loading: the process of the cell has been started, and imports torch. epoch: the number of completed epochs, out of
+    `epochs`. metrics: those of the epoch, or of the final evaluation. bad_input: the cell failed before its run started
+    because of the user's input; `message` explains why.
     """
 
     kind: Kind

@@ -191,6 +191,8 @@ class _Pool:
             worker = _Worker(Job(cells[0].spec, seeds, self._store.url, self._settings), self._command)
             self._workers.append(worker)
             self._selector.register(worker.stdout, selectors.EVENT_READ, worker)
+            for cell in cells:
+                self._on_event(Event("loading", cell, None, 0, cell.spec.epochs))
 
     def _receive(self, worker: _Worker) -> None:
         events = worker.read()

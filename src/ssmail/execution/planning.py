@@ -115,6 +115,23 @@ def estimated_seconds(runs: Sequence[RunRow], specs: Sequence[RunSpec]) -> dict[
     return {spec: seconds(spec) for spec in specs}
 
 
+def least_seconds(runs: Sequence[RunRow], spec: RunSpec) -> float | None:
+    """Return a time that a run of the spec takes at least: its updates at the pace of smaller stored runs.
+
+    Those are the finished runs of the method and environment whose networks and batches are at most as large, of any
+    profile. None without such runs.
+    """
+    sizes = _sizes(spec.model_dump())
+    rates = [
+        run.wall_seconds / updates
+        for run in runs
+        if (run.method, run.environment) == (spec.method, spec.environment)
+        and all(small <= large for small, large in zip(_sizes(run.spec), sizes, strict=True))
+        and (updates := _updates(run.spec.get("training")))
+    ]
+    return median(rates) * _updates(spec.model_dump()["training"]) if rates else None
+
+
 def total_seconds(each: Sequence[float], jobs: int) -> float:
     """Estimate the seconds that runs of these durations take, `jobs` at a time; at least the longest duration."""
     return max(sum(each) / jobs, *each) if each else 0.0
@@ -130,6 +147,12 @@ def longest_first(cells: Sequence[Cell], seconds: Mapping[RunSpec, float | None]
         return True, -known
 
     return sorted(cells, key=rank)
+
+
+def _sizes(values: Mapping[str, Any]) -> list[int]:
+    """Return the width of the networks and the size of a batch; 0 for what a method does not have."""
+    keys = (("model", "hidden"), ("variational", "hidden"), ("training", "batch"))
+    return [int((values.get(section) or {}).get(key, 0)) for section, key in keys]
 
 
 def _updates(training: Mapping[str, Any] | None) -> int:

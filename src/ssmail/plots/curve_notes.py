@@ -4,10 +4,13 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 
 from ssmail.evaluation.hypothesis_tests import MAX_SPLITS, permutation_test
 from ssmail.plots import style
 from ssmail.plots.curves import CEILING, Band
+from ssmail.plots.formatting import counted
+from ssmail.store import RunRow, Store
 
 
 def of_errors(bands: Sequence[Band]) -> tuple[str, ...]:
@@ -32,6 +35,21 @@ def high(bands: Sequence[Band], end: float = CEILING) -> tuple[str, ...]:
     }
     return tuple(
         f"{label}: {n} of the runs rise above {end:.3g}, where the scale ends." for label, n in counts.items() if n
+    )
+
+
+def compact(store: Store, metric: str, runs: Sequence[RunRow], values: pd.DataFrame) -> tuple[str, ...]:
+    """Say of how many runs a compact database kept the last value of the metric alone.
+
+    values: the stored ones, a row for each run and step. A metric of the test has no other value anyway.
+    """
+    steps = {str(run_id): list(own) for run_id, own in values.groupby("run_id")["step"]}
+    single = [run for run in runs if len(steps[run.id]) == 1 < steps[run.id][0] and store.is_compact(run)]
+    if not single or metric.startswith("test"):
+        return ()
+    return (
+        f"{metric}: of {counted(len(single), 'run')} the last value alone is stored, for {store.where} is compact: it "
+        "keeps the curves that figures and claims read.",
     )
 
 

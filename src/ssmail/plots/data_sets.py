@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssmail.config.experiments_file import load_experiments
-from ssmail.config.spec import METHODS
+from ssmail.config.names import METHODS
 from ssmail.errors import command_line, printable, shortened
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import as_file_name

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -59,6 +60,12 @@ def spans(numbers: list[int]) -> str:
         else:
             parts.append([value])
     return ", ".join(str(part[0]) if len(part) == 1 else f"{part[0]}-{part[-1]}" for part in parts)
+
+
+def listed(words: Iterable[object], conjunction: str = "or") -> str:
+    """["a", "b", "c"] -> "a, b or c"."""
+    *first, last = map(str, words)
+    return f"{', '.join(first)} {conjunction} {last}" if first else last
 
 
 def as_file_name(text: str) -> str:

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 
+from ssmail.config.names import flatten
 from ssmail.errors import InputError
 from ssmail.plots import landscape_grids, saving, style
 from ssmail.plots.landscape_grids import Landscape
@@ -73,11 +74,15 @@ def collect(store: Store, run_id: str, figure: str, epoch: int | None = None) ->
     chosen = epochs if figure == FILM else [epochs[-1] if epoch is None else epoch]
     what = f"{run.method} on {run.environment}, seed {run.seed}, {run.state}"
     there = f"landscapes of epochs {', '.join(map(str, epochs))}"
+    notes = [f"run {run.name}: {what}; {there}."]
+    made = flatten(run.spec).get("evaluation.landscapes")
+    if figure == FILM and isinstance(made, int) and len(epochs) < made and store.is_compact(run):
+        notes.append(f"{store.where} is compact: of the {made} landscapes of the run it keeps those that figures show.")
     return LandscapeRecord(
         run=run,
         landscapes=tuple(landscape_grids.read(store, run, one) for one in chosen),
         provenance=Provenance.of(figure, [run]),
-        notes=(f"run {run.name}: {what}; {there}.",),
+        notes=tuple(notes),
     )
 
 

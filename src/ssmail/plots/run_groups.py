@@ -7,7 +7,7 @@ from datetime import datetime
 from typing import Any, NamedTuple
 
 from ssmail.config.experiments import to_tuples
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError
 from ssmail.plots.formatting import counted
 from ssmail.store import RunRow

@@ -25,7 +25,8 @@ from ssmail.config.experiments import (
     figure_requirements,
 )
 from ssmail.config.experiments_file import load_experiments
-from ssmail.config.spec import RunSpec, flatten
+from ssmail.config.names import flatten
+from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, command_line
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
@@ -100,6 +100,7 @@ def collect(
         drawn |= {run.id: run for group in groups for run in group.runs}
         curve_of |= {run.id: group.label for group in groups for run in group.runs}
         notes += left_out
+        notes += curve_notes.compact(store, metric, [run for group in groups for run in group.runs], values)
         if panels[-1].logarithmic:
             notes += curve_notes.cut(panels[-1].bands)
     options = {"metrics": [panel.metric for panel in panels], "group_by": group_by, "statistic": statistic}

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.store.computed_metrics import computed_metrics, note
 from ssmail.store.queries import RunRow
 from ssmail.store.run_store import Store

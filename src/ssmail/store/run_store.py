@@ -303,6 +303,10 @@ class Store:
         with reading(self._engine) as connection:
             return queries.artifacts(connection, run_id, self.checkpoint_root, self.damaged)
 
+    def is_compact(self, run: RunRow) -> bool:
+        """Return whether a run that ended has no checkpoint: a compact database keeps only what figures read of it."""
+        return run.state.settled and not self.artifacts(run.id)
+
 
 def _interrupt(connection: Connection, row: RunRow) -> None:
     """Mark a run whose process is silent as INTERRUPTED."""

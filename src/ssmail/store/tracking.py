@@ -8,7 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError, missing_package, shortened
 from ssmail.store.queries import RunRow
 from ssmail.store.run_store import Store

@@ -14,7 +14,8 @@ from typing import Any
 import sqlalchemy as sa
 from pydantic import ValidationError
 
-from ssmail.config.spec import ENVIRONMENTS, METHODS, RunSpec, required_sections, with_added_keys
+from ssmail.config.names import ENVIRONMENTS, METHODS
+from ssmail.config.spec import RunSpec, required_sections, with_added_keys
 from ssmail.errors import shortened
 from ssmail.store import arrays, schema
 from ssmail.store.schema import RunState
