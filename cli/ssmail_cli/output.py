@@ -37,6 +37,13 @@ class Format(StrEnum):
     TABLE = "table"
     CSV = "csv"
     JSON = "json"
+    LATEX = "latex"
+    MARKDOWN = "markdown"
+
+    @property
+    def of_document(self) -> bool:
+        """Whether this is a table to put into a document."""
+        return self in (Format.LATEX, Format.MARKDOWN)
 
 
 def chosen_format(as_json: bool, chosen: Format | None) -> Format:
@@ -102,6 +109,8 @@ def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) ->
     """Print rows. `columns` maps the keys that a table shows to their headings; CSV and JSON have every key."""
     if form is Format.TABLE:
         print_table(rows, columns)
+    elif form.of_document:
+        print_document_table(rows, columns, form)
     elif form is Format.CSV:
         write_csv(rows, list(rows[0]) if rows else list(columns), None)
     else:
@@ -141,20 +150,39 @@ def short(value: Any, digits: int = 4) -> str:
     return shortened(str(value), LONGEST_CELL)
 
 
-def print_table(rows: Sequence[Row], columns: Mapping[str, str]) -> None:
-    """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits."""
+def print_table(rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence[str] = ()) -> None:
+    """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits.
+
+    If that is not enough, the columns of `spare` are left out, the first ones first, and a line says so.
+    """
     from rich.console import Console
     from rich.measure import Measurement
 
     console = Console()
     unlimited = console.options.update(max_width=10_000)
-    for gap, digits in ((2, 4), (1, 4), (1, 3)):
-        table = _table(rows, columns, gap, digits)
+    narrower = [(2, 4, ()), (1, 4, ()), *((1, 3, spare[:count]) for count in range(len(spare) + 1))]
+    for gap, digits, without in narrower:
+        shown = {key: heading for key, heading in columns.items() if key not in without}
+        table = _table(rows, shown, gap, digits)
         if Measurement.get(console, unlimited, table).maximum <= console.width:
             break
     with console.capture() as capture:
         console.print(table)
     sys.stdout.write(capture.get())
+    if len(shown) < len(columns):
+        left_out = [heading.replace("\n", " ") for key, heading in columns.items() if key not in shown]
+        say(f"left out, as the terminal is narrow: {', '.join(left_out)}")
+
+
+def print_document_table(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
+    """Print a table as LaTeX or Markdown, with four digits."""
+    from ssmail_cli import document_tables
+
+    headings = [heading.replace("/\n", "/").replace("\n", " ") for heading in columns.values()]
+    numeric = [document_tables.is_numeric(rows, key) for key in columns]
+    cells = [[short(row.get(key)) for key in columns] for row in rows]
+    written = document_tables.latex if form is Format.LATEX else document_tables.markdown
+    sys.stdout.write(written(cells, headings, numeric) + "\n")
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":

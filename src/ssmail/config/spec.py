@@ -214,6 +214,7 @@ def nearest_key(name: str, others: Iterable[str] = ()) -> str:
     values = [key for key, is_section in spec_keys().items() if not is_section]
     close = [key for key in values if key.rpartition(".")[2] == name] or difflib.get_close_matches(name, others, n=1)
     by_last = {key.rpartition(".")[2]: key for key in reversed(values)}
+    close = close or [key for key in values if key.startswith(f"{name}.")]
     close = close or [by_last[last] for last in difflib.get_close_matches(name, by_last, n=1)]
     if close:
         return f"did you mean {' or '.join(close[:3])}?"
