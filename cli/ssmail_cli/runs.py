@@ -170,8 +170,9 @@ def compare(
         _print_comparisons(found)
         return
     if kind.of_document:
-        for specs_alike in _by_environment(found):
-            print_rows(*_overview(specs_alike), kind)
+        for alike in _by_environment(found):
+            names = ["spec", "seeds", *(item.metric for item in alike[0])]
+            print_rows([_overview_row(group) for group in alike], {name: name for name in names}, kind)
         return
     seeds = sorted({seed for item in found for seed in item.values})
     print_rows([_comparison_row(item, seeds, kind) for item in found], {}, kind)
@@ -372,7 +373,8 @@ def _print_comparisons(found: "list[Comparison]") -> None:
         if len(alike) > 1:
             environment = alike[0][0].environment
             say(*between, f"{environment}: mean ± standard deviation; seeds: with the first metric, of all")
-            print_table(*_overview(alike))
+            columns = {"spec": "spec", "seeds": "seeds", **_headings(alike[0])}
+            print_table([_overview_row(group) for group in alike], columns)
             between = ("",)
 
 
@@ -380,12 +382,6 @@ def _by_environment(found: "list[Comparison]") -> "list[list[list[Comparison]]]"
     """Return the comparisons by environment, and in it those of each spec together."""
     specs = [list(metrics) for _, metrics in groupby(found, key=lambda item: item.spec_hash)]
     return [list(groups) for _, groups in groupby(specs, key=lambda group: group[0].environment)]
-
-
-def _overview(specs: "list[list[Comparison]]") -> tuple[list[dict[str, Any]], dict[str, str]]:
-    """Return a row for each spec, and the columns of their table."""
-    columns = {"spec": "spec", "seeds": "seeds", **_headings(specs[0])}
-    return [_overview_row(group) for group in specs], columns
 
 
 def _overview_row(group: "list[Comparison]") -> dict[str, Any]:
