@@ -45,6 +45,7 @@ docs/tutorial
 docs/data-format
 docs/python
 docs/reference/commands
+docs/reference/keys
 docs/adapters
 docs/extending
 docs/database

@@ -1,7 +1,7 @@
 """Sphinx extension that writes the reference pages when a build starts: docs/reference/, which git ignores.
 
-`commands.md` is read off the Typer application, `api/` has a page for each package of ssmail, filled by autodoc. So
-neither can disagree with the code.
+`commands.md` is read off the Typer application, `keys.md` off the sections of the spec, and `api/` has a page for each
+package of ssmail, filled by autodoc. So none of them can disagree with the code.
 """
 
 import importlib
@@ -15,6 +15,8 @@ import typer
 from sphinx.application import Sphinx
 
 import ssmail
+from ssmail.config import keys
+from ssmail.config.strict_yaml import inline
 from ssmail_cli.main import app as application
 
 FOLDER = Path(__file__).parent / "reference"
@@ -66,6 +68,32 @@ def _commands() -> str:
     return "\n".join(["# Commands", "", *_command(command, context)])
 
 
+KEYS = """\
+# Settings
+
+Every key of a spec. Set one with `--set sac.gamma=0.9`, vary one with `ssmail ablate sac.gamma --values 0.8,0.9`, or
+change a default in an experiments.yaml of your own (`ssmail config init`). `ssmail config show` prints the values of a
+method, environment and profile, and the layer that each comes from; `ssmail config keys` prints this page.
+
+A range is an interval: in [0, 1) is 0, and 1 is not. The default is that of the layer `defaults` of experiments.yaml.
+Method, environment and profile are not keys: they are given with `--method`, `--env` and `--profile`.
+"""
+
+
+def _keys() -> str:
+    lines = [KEYS]
+    for section in keys.reference():
+        lines += [f"## {section.name}", "", _escape(section.meaning), ""]
+        lines += [f"Only of {', '.join(section.used_by)}.", ""] if section.used_by else []
+        lines += ["| key | type | unit | range | default | meaning |", "|---|---|---|---|---|---|"]
+        for key in section.keys:
+            cells = map(_cell, (key.kind, key.unit or "", key.range or ""))
+            default = f"`{inline(key.default)}`"
+            lines.append(f"| {' | '.join((f'`{key.name}`', *cells, default, _cell(key.meaning)))} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
 def _modules(package: str) -> list[str]:
     """Return the public modules of a package and its subpackages, itself first."""
     path = importlib.import_module(package).__path__
@@ -84,6 +112,7 @@ def _page(package: str) -> str:
 
 def _write_pages(app: Sphinx) -> None:
     _write(FOLDER / "commands.md", _commands())
+    _write(FOLDER / "keys.md", _keys())
     packages = sorted(name for _, name, is_package in pkgutil.iter_modules(ssmail.__path__, "ssmail.") if is_package)
     for package in packages:
         _write(FOLDER / "api" / f"{package}.rst", _page(package))

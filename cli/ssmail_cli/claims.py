@@ -73,6 +73,9 @@ def claims(
     if kind is Format.CSV:
         print_rows([row for found in judgements for row in _part_rows(found)], {}, kind)
         return
+    if kind.of_document:
+        print_rows([_summary(found) for found in judgements], SUMMARY, kind)
+        return
     print_table([_summary(found) for found in judgements], SUMMARY, spare=SPARE)
     say(*_wrapped(LEGEND, 0))
     for found in judgements if wanted else ():
@@ -87,7 +90,7 @@ def _summary(found: "Judgement") -> dict[str, Any]:
     unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
         "claim": f"{found.claim.name} {found.claim.alias}",
-        "profile": found.profile,
+        "profile": found.settings,
         "verdict": found.verdict.value,
         "p": decision.p,
         "corrected": found.corrected.value,
@@ -110,6 +113,7 @@ def _as_json(found: "Judgement") -> dict[str, Any]:
         "more_seeds": decision.more_seeds,
         "command": found.command,
         "profile": found.profile,
+        "settings": found.settings,
         "runs": found.runs,
         "notes": found.notes,
         "parts": [_part_value(part) for part in decision.parts],
@@ -149,7 +153,7 @@ def _claim_lines(found: "Judgement") -> list[str]:
     for part in found.decision.parts:
         lines += _part_lines(part)
     if found.runs:
-        lines += _wrapped(f"runs of profile {found.profile}: {' '.join(run[:8] for run in found.runs)}", 2)
+        lines += _wrapped(f"runs of profile {found.settings}: {' '.join(run[:8] for run in found.runs)}", 2)
     if found.command:
         lines += _wrapped(f"next: {found.command}", 2)
     return lines

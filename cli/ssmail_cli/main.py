@@ -1,5 +1,6 @@
 """The Typer application: its commands, and how a failure ends (one line on stderr and an exit code)."""
 
+import logging
 import os
 import re
 import sys
@@ -12,6 +13,7 @@ from ssmail.errors import ExitCode, SsmailError, shortened
 from ssmail_cli import (
     claims,
     completion,
+    config,
     datasets,
     db,
     explain,
@@ -32,10 +34,12 @@ from ssmail_cli.output import (
     discard_stdout,
     error_line,
     guard_streams,
+    note,
     print_remarks,
     say,
 )
 
+_LOG = logging.getLogger("ssmail")
 _NO_TEXT = re.compile("[\0\ud800-\udfff]")  # a null, or a byte that is not UTF-8, as Python passes it on
 
 app = typer.Typer(
@@ -64,6 +68,14 @@ app.command("export-model")(forecast.export_model)
 app.add_typer(plot.app, name="plot")
 app.add_typer(runs.app, name="runs")
 app.add_typer(db.app, name="db")
+app.add_typer(config.app, name="config")
+
+
+class _Notes(logging.Handler):
+    """Prints what ssmail logs as notes on stderr."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        note(record.getMessage())
 
 
 def _print_version(wanted: bool) -> None:
@@ -120,6 +132,8 @@ def run(arguments: list[str]) -> int:
     for argument in arguments:
         if _NO_TEXT.search(argument):  # neither a database nor a file format can hold it
             return _complain(f"the argument {shortened(argument, 60)} is not UTF-8 text; rename it", ExitCode.BAD_INPUT)
+    if not _LOG.handlers:
+        _LOG.addHandler(_Notes())
     os.environ["MPLBACKEND"] = "agg"  # figures are only saved, and another value may name any module
     try:
         try:

@@ -137,6 +137,20 @@ Figure = Annotated[
         autocompletion=completion.figures,
     ),
 ]
+Where = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--where",
+        metavar="CONDITION",
+        help="Only runs that meet this condition on a key of the spec, a metric or a column, such as sac.gamma=0.9, "
+        "test/mode_mse<0.003 or seed!=0; repeatable, in quotes.",
+    ),
+]
+Sort = Annotated[
+    str | None,
+    typer.Option("--sort", metavar="[-]NAME", help="Order by this key, metric or column; -NAME is from high to low."),
+]
+Descending = Annotated[bool, typer.Option("--descending", help="With --sort, from high to low.")]
 
 # Training
 SEEDS_HELP = "Seeds, one run each: 0-4 for five of them, 0,2,5 or 0-2,7; a single number is one seed, not a count."
@@ -252,18 +266,24 @@ def select_runs(
     profile: str | None,
     state: str | None,
     figure: str | None,
+    where: list[str] | None = None,
 ) -> "list[RunRow]":
-    """Return the runs that meet every condition, newest last. Raises InputError for an unknown id, state or figure."""
+    """Return the runs that meet every condition, newest last.
+
+    Raises InputError for an unknown id, state or figure, and for a condition that is none.
+    """
     from ssmail.plots.series import needed_by
     from ssmail.store import RunState
+    from ssmail.store.conditions import Condition, matching
 
+    conditions = [Condition.parse(text) for text in where or ()]
     if state is not None and state not in list(RunState):
         raise unknown_name("state", state, list(RunState))
     runs = store.runs(ids=ids or None, method=method, environment=environment, profile=profile, state=state)
-    if figure is None:
-        return runs
-    needed = needed_by(FIGURES[figure].name if figure in FIGURES else figure)  # experiments.yaml knows no aliases
-    return [run for run in runs if needed(run)]
+    if figure is not None:
+        needed = needed_by(FIGURES[figure].name if figure in FIGURES else figure)  # experiments.yaml knows no aliases
+        runs = [run for run in runs if needed(run)]
+    return matching(store, runs, conditions)
 
 
 def parse_seeds(text: str) -> list[int]:

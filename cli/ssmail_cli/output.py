@@ -38,6 +38,13 @@ class Format(StrEnum):
     TABLE = "table"
     CSV = "csv"
     JSON = "json"
+    LATEX = "latex"
+    MARKDOWN = "markdown"
+
+    @property
+    def of_document(self) -> bool:
+        """Whether this is a table to put into a document."""
+        return self in (Format.LATEX, Format.MARKDOWN)
 
 
 def chosen_format(as_json: bool, chosen: Format | None) -> Format:
@@ -103,6 +110,8 @@ def print_rows(rows: Sequence[Row], columns: Mapping[str, str], form: Format) ->
     """Print rows. `columns` maps the keys that a table shows to their headings; CSV and JSON have every key."""
     if form is Format.TABLE:
         print_table(rows, columns)
+    elif form.of_document:
+        print_document_table(rows, columns, form)
     elif form is Format.CSV:
         write_csv(rows, list(rows[0]) if rows else list(columns), None)
     else:
@@ -164,6 +173,17 @@ def print_table(rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence
     if len(shown) < len(columns):
         left_out = [heading.replace("\n", " ") for key, heading in columns.items() if key not in shown]
         say(f"left out, as the terminal is narrow: {', '.join(left_out)}")
+
+
+def print_document_table(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:
+    """Print a table as LaTeX or Markdown, with four digits."""
+    from ssmail_cli import document_tables
+
+    headings = [heading.replace("/\n", "/").replace("\n", " ") for heading in columns.values()]
+    numeric = [document_tables.is_numeric(rows, key) for key in columns]
+    cells = [[short(row.get(key)) for key in columns] for row in rows]
+    written = document_tables.latex if form is Format.LATEX else document_tables.markdown
+    sys.stdout.write(written(cells, headings, numeric) + "\n")
 
 
 def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":

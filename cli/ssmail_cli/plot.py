@@ -219,6 +219,54 @@ def _chosen_runs(store: "Store", methods: Sequence[str] | None, **conditions: An
 
 
 @app.command(epilog=EPILOG)
+def ablation(
+    ctx: typer.Context,
+    keys: Annotated[
+        list[str],
+        typer.Option("--key", help="The key that varies, or the name of an ablation; a second one becomes colours."),
+    ],
+    metrics: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="Draw this metric; repeatable.", show_default="the test error"),
+    ] = None,
+    methods: Methods = None,
+    environment: options.Environment = None,
+    profile: options.Profile = None,
+    where: options.Where = None,
+    runs: OnlyRuns = None,
+    stat: Annotated[
+        str | None,
+        typer.Option(
+            "--stat",
+            callback=options.known_statistic,
+            help=f"Centre and spread: {options.STATISTICS}.",
+            show_default="median-iqr",
+        ),
+    ] = None,
+) -> None:
+    """Any metric against the values of a key of the spec, or of two, as `ssmail ablate KEY` trains them.
+
+    Draws the runs that differ in these keys alone, of those the most; with --runs, all of these runs. Points are runs,
+    beside them centre and spread of each value.
+    """
+    from ssmail.config.experiments_file import load_experiments
+    from ssmail.evaluation.statistics import Statistic
+    from ssmail.plots import ablation as figure
+    from ssmail.store.conditions import Condition, matching
+
+    named = load_experiments().ablations
+    keys = [str(named[key].get("key")) if key in named else key for key in keys]
+    statistic, store = parse_statistic(stat) or Statistic.MEDIAN_IQR, open_store(ctx.obj.db)
+    chosen = _chosen_runs(store, methods, ids=runs, environment=environment, profile=profile)
+    chosen = matching(store, chosen, [Condition.parse(text) for text in where or ()])
+    with stored_values("these runs"):
+        selection = figure.select(store, chosen, keys, named=bool(runs))
+        shown = metrics or [environment_metrics(selection.runs[0].environment).error]
+        record = figure.collect(store, selection, keys, shown, statistic)
+        ctx.obj.save("ablation", record.stem, record, figure.draw(record))
+
+
+@app.command(epilog=EPILOG)
 def forecast(
     ctx: typer.Context,
     methods: Methods = None,

@@ -98,8 +98,16 @@ def key_metrics(environments: Iterable[str]) -> dict[str, str | None]:
 
 
 def run_row(run: "RunRow") -> dict[str, Any]:
-    """Return the columns of a stored run by name, without its spec and its owner."""
-    return {item.name: getattr(run, item.name) for item in fields(run) if item.name not in ("spec_json", "owner")}
+    """Return the columns of a stored run by name, without its spec and its owner; `settings` and `changes` tell how the
+    spec differs from the profile.
+    """
+    row: dict[str, Any] = {}
+    for item in fields(run):
+        if item.name not in ("spec_json", "owner"):
+            row[item.name] = getattr(run, item.name)
+        if item.name == "profile":
+            row |= {"settings": run.settings, "changes": run.changes}
+    return row
 
 
 def rows_with_metrics(store: "Store", runs: "Sequence[RunRow]", names: Sequence[str]) -> list[dict[str, Any]]:

@@ -1,7 +1,7 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
 from collections.abc import Iterator, Sequence
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,11 +49,12 @@ RUN_COLUMNS = {
     "state": "state",
     "method": "method",
     "environment": "env",
-    "profile": "profile",
+    "settings": "profile",
     "seed": "seed",
     "spec": "spec",
     "started": "start (UTC)",
 }
+SPARE = ("spec", "started")  # what a narrow terminal leaves out first
 EXPORT_COLUMNS = ("run_id", "method", "environment", "profile", "seed", "state", "spec_hash", "name", "step", "value")
 
 
@@ -65,30 +66,46 @@ def list_runs(
     profile: options.Profile = None,
     state: options.State = None,
     figure: options.Figure = None,
+    where: options.Where = None,
+    sort: options.Sort = None,
+    descending: options.Descending = False,
+    limit: Annotated[
+        int | None,
+        typer.Option("--limit", min=1, help="Only so many runs: the newest, or with --sort the first."),
+    ] = None,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """List runs with their test error, the newest last.
 
-    CSV and JSON have every column.
+    What --where and --sort name has a column too. CSV and JSON have every column.
     """
+    from ssmail.store.conditions import in_order
+
     store = options.open_store(db)
-    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure, where)
     if not runs:
         note(f"no run in {store.where} meets these conditions")
+    name, descending = _order(sort, descending)
+    if name is not None:
+        runs = in_order(store, runs, name, descending)
+    runs = _limited(runs, limit, first=name is not None)
     errors = list(dict.fromkeys(environment_metrics(run.environment).error for run in runs))
     rows = rows_with_metrics(store, runs, errors)
+    extra = _add_named(store, runs, rows, where, name)
     kind = chosen_format(as_json, form)
-    if kind is Format.TABLE:
-        short_rows = [
-            {**row, "spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
-            for row in rows
-        ]
-        heading = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
-        print_table(short_rows, {**RUN_COLUMNS, "error": heading})
-    else:
+    if kind in (Format.CSV, Format.JSON):
         print_rows(rows, {**RUN_COLUMNS, **dict.fromkeys(errors, "")}, kind)
+        return
+    for row in rows:
+        row |= {"spec": row["spec_hash"][:8], "error": row[environment_metrics(row["environment"]).error]}
+    heading = errors[0].rpartition("/")[2] if len(errors) == 1 else "test\nerror"
+    columns = {**RUN_COLUMNS, **{key: _heading(key) for key in extra if key not in errors}, "error": heading}
+    if kind is Format.TABLE:
+        print_table(rows, columns, spare=SPARE)
+    else:
+        print_rows(rows, columns, kind)
 
 
 @app.command()
@@ -132,6 +149,13 @@ def compare(
     profile: options.Profile = None,
     state: options.State = None,
     figure: options.Figure = None,
+    where: options.Where = None,
+    sort: options.Sort = None,
+    descending: options.Descending = False,
+    limit: Annotated[
+        int | None,
+        typer.Option("--limit", min=1, help="Only so many specs: the newest, or with --sort the first."),
+    ] = None,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
@@ -140,12 +164,20 @@ def compare(
 
     Groups the runs that differ only in the seed, and shows mean, standard deviation (n - 1), median and the value of
     each seed's newest run; for a run without the metric, its state. test/on_path, test/path_rms and test/turn_* of runs
-    stored before there were such metrics are computed from the rollouts stored of them.
+    stored before there were such metrics are computed from the rollouts stored of them. --sort by a metric takes the
+    mean of each spec. As latex or markdown, prints a table of the specs with mean and standard deviation.
     """
+    from ssmail.store.conditions import specs_in_order
+
     store = options.open_store(db)
-    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure, where)
     if not runs:
         note(f"no run in {store.where} meets these conditions")
+    name, descending = _order(sort, descending)
+    if name is not None:
+        runs = specs_in_order(store, runs, name, descending)
+    specs = _limited(list(dict.fromkeys(run.spec_hash for run in runs)), limit, first=name is not None)
+    runs = [run for run in runs if run.spec_hash in specs]
     found = _compared(store, runs, metrics)
     for metric in metrics or ():
         if runs and not any(item.known for item in found if item.metric == metric):
@@ -156,6 +188,11 @@ def compare(
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
         _print_comparisons(found)
+        return
+    if kind.of_document:
+        for alike in _by_environment(found):
+            names = ["spec", "seeds", *(item.metric for item in alike[0])]
+            print_rows([_overview_row(group) for group in alike], {name: name for name in names}, kind)
         return
     seeds = sorted({seed for item in found for seed in item.values})
     print_rows([_comparison_row(item, seeds, kind) for item in found], {}, kind)
@@ -176,6 +213,7 @@ def export(
     profile: options.Profile = None,
     state: options.State = None,
     figure: options.Figure = None,
+    where: options.Where = None,
     as_json: options.Json = False,
     form: Annotated[
         Format, typer.Option("--format", help="csv: one line per value; json: runs with specs and metrics.")
@@ -188,12 +226,12 @@ def export(
     --backend-store-uri DIR`.
     """
     if to is not None:
-        _export_to(to, out, options.open_store(db), (ids, method, environment, profile, state, figure))
+        _export_to(to, out, options.open_store(db), (ids, method, environment, profile, state, figure, where))
         return
-    if form is Format.TABLE:
+    if form is Format.TABLE or form.of_document:
         raise InputError("an export is csv or json, not a table; `ssmail runs list` prints tables.")
     store = options.open_store(db)
-    runs = options.select_runs(store, ids, method, environment, profile, state, figure)
+    runs = options.select_runs(store, ids, method, environment, profile, state, figure, where)
     if as_json or form is Format.JSON:
         write_json(
             [{**run_row(run), "spec": run.spec, "metrics": _values(store.metrics([run.id]))} for run in runs], out
@@ -231,6 +269,41 @@ def delete(
             raise typer.Exit(ExitCode.FAILURE)
     store.delete(full)
     note(f"deleted {names}")
+
+
+def _order(sort: str | None, descending: bool) -> tuple[str | None, bool]:
+    """Return the name to sort by and whether from high to low, which a hyphen before the name says too."""
+    if sort is None and descending:
+        raise InputError("--descending is for --sort; name what to sort by, such as --sort test/mode_mse.")
+    return (sort[1:], True) if sort is not None and sort.startswith("-") else (sort, descending)
+
+
+def _limited(items: list[Any], limit: int | None, first: bool) -> list[Any]:
+    """Return so many of the items, the first or the last ones; all of them without a limit."""
+    if limit is None:
+        return items
+    return items[:limit] if first else items[-limit:]
+
+
+def _add_named(
+    store: "Store", runs: "Sequence[RunRow]", rows: list[dict[str, Any]], where: list[str] | None, sort: str | None
+) -> list[str]:
+    """Add to the rows what conditions and order name and they lack, and return these names."""
+    from ssmail.config.experiments import display_value
+    from ssmail.store.conditions import COLUMNS, Condition, values_of
+
+    names = dict.fromkeys([*(Condition.parse(text).name for text in where or ()), *([sort] if sort else [])])
+    named = [name for name in names if name not in COLUMNS]
+    for name in named:
+        values = values_of(store, runs, name)
+        for row in rows:
+            row[name] = display_value(values.get(row["id"]))
+    return named
+
+
+def _heading(name: str) -> str:
+    """Return a key or metric as a heading: gamma, test/ above mode_mse."""
+    return name.replace("/", "/\n") if "/" in name else name.rpartition(".")[2]
 
 
 def _export_to(tool: str, out: Path | None, store: "Store", selection: Any) -> None:
@@ -304,8 +377,7 @@ def _print_comparisons(found: "list[Comparison]") -> None:
     """Print a table for each spec, with a row for each seed, mean, std and median and a column for each metric; then a
     table of the specs of each environment that has several.
     """
-    specs = [list(metrics) for _, metrics in groupby(found, key=lambda item: item.spec_hash)]
-    for group in specs:
+    for group in chain.from_iterable(_by_environment(found)):
         first = group[0]
         rows: list[dict[str, Any]] = [
             {"seed": str(seed) if state == "finished" else f"{seed} {state}"}
@@ -314,18 +386,25 @@ def _print_comparisons(found: "list[Comparison]") -> None:
         ]
         for name in ("mean", "std", "median"):
             rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
-        differs = "".join(f", {key}={short(value)}" for key, value in first.differs.items())
-        say(f"{first.method} on {first.environment}, profile {first.profile}, spec {first.spec_hash[:8]}{differs}")
+        told = (f", {key}={short(value)}" for key, value in first.differs.items() if key not in first.changes)
+        about = f"{first.method} on {first.environment}, profile {first.settings}, spec {first.spec_hash[:8]}"
+        say(about + "".join(told))
         print_table(rows, {"seed": "seed", **_headings(group)})
         say("")
     between: tuple[str, ...] = ()
-    for environment, groups in groupby(specs, key=lambda group: group[0].environment):
-        alike = list(groups)
+    for alike in _by_environment(found):
         if len(alike) > 1:
+            environment = alike[0][0].environment
             say(*between, f"{environment}: mean ± standard deviation; seeds: with the first metric, of all")
             columns = {"spec": "spec", "seeds": "seeds", **_headings(alike[0])}
             print_table([_overview_row(group) for group in alike], columns)
             between = ("",)
+
+
+def _by_environment(found: "list[Comparison]") -> "list[list[list[Comparison]]]":
+    """Return the comparisons by environment, and in it those of each spec together."""
+    specs = [list(metrics) for _, metrics in groupby(found, key=lambda item: item.spec_hash)]
+    return [list(groups) for _, groups in groupby(specs, key=lambda group: group[0].environment)]
 
 
 def _overview_row(group: "list[Comparison]") -> dict[str, Any]:
@@ -349,6 +428,7 @@ def _comparison_row(item: "Comparison", seeds: Sequence[int], kind: Format) -> d
         "method": item.method,
         "environment": item.environment,
         "profile": item.profile,
+        "settings": item.settings,
         "spec_hash": item.spec_hash,
         "differs": dict(item.differs),
         "metric": item.metric,

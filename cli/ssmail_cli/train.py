@@ -1,9 +1,10 @@
-"""`ssmail train` and `ssmail ablate`: sweeps over seeds, and over values of one key, into the store."""
+"""`ssmail train` and `ssmail ablate`: sweeps over seeds, and over values of keys, into the store."""
 
 import sys
+from collections.abc import Sequence
 from dataclasses import fields
 from itertools import product
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperCommand
@@ -11,10 +12,15 @@ from typer.core import TyperCommand
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
+from ssmail.plots.formatting import counted
 from ssmail_cli import completion, options
 from ssmail_cli.options import parse_seeds, pick_device
 from ssmail_cli.output import note
 from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
+
+if TYPE_CHECKING:
+    from ssmail.config.experiments import Axis
+    from ssmail.config.spec import RunSpec
 
 
 def train(
@@ -78,21 +84,27 @@ def train(
 
 
 def ablate(
-    name: Annotated[
-        str,
+    names: Annotated[
+        list[str],
         typer.Argument(
-            metavar="NAME",
-            help="alpha, beta, curriculum or label, or one of your experiments.yaml.",
+            metavar="NAME|KEY...",
+            help="What varies: alpha, beta, curriculum, label or an ablation of your experiments.yaml, or any key of "
+            "the spec (`ssmail config keys`); several make a grid.",
             autocompletion=completion.ablations,
         ),
     ],
     values: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
             "--values",
-            help="The values: 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once.",
+            help="The values: 0,0.1,0.15 or [0,1],[-1,1] or identity,zero-above-one; each once. In a grid, repeat it "
+            "for each name in turn, or write KEY=0.8,0.9.",
             show_default="those of experiments.yaml",
         ),
+    ] = None,
+    method: Annotated[
+        str | None,
+        typer.Option("--method", help="The method to train.", show_default="the ablation's, and ssail for a key"),
     ] = None,
     environment: Annotated[
         str | None,
@@ -100,7 +112,7 @@ def ablate(
             "--env",
             metavar="ENV",
             help=f"Train on this environment: {options.ENVIRONMENT_NAMES}.",
-            show_default="the ablation's in experiments.yaml",
+            show_default="the ablation's, and yjunction for a key",
             autocompletion=completion.environments,
         ),
     ] = None,
@@ -114,21 +126,22 @@ def ablate(
     as_json: options.Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Train a method for several values of one key of its spec.
+    """Train a method for several values of one key of its spec, or for a grid of values of several keys.
 
-    Each value and seed make a run: finished runs are skipped, unfinished ones resumed. Ctrl-C saves and stops. The
-    ablations are entries of experiments.yaml; `ssmail ablate-beta` is short for `ssmail ablate beta`.
+    `ssmail ablate sac.gamma --values 0.9,0.95,0.99` varies any key; `ssmail ablate sac.gamma=0.9,0.95
+    curriculum.beta=0,0.15` all combinations of two. Entries of experiments.yaml have a name, values and settings of
+    their own; `ssmail ablate-beta` is short for `ssmail ablate beta`. Each value and seed make a run: finished runs are
+    skipped, unfinished ones resumed. Ctrl-C saves and stops.
     """
-    from ssmail.config.experiments import ablation, ablation_specs, display_value
+    from ssmail.config.experiments import display_value, grid_specs
     from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
-    column = _column(ablation(name, environment).key)
-    chosen_values = None if values is None else parse_values(values)
-    specs = ablation_specs(name, profile, chosen_values, settings or [], environment=environment)
+    grid = grid_specs(_axes(names, values or ()), profile, settings or [], method=method, environment=environment)
+    columns = _columns(grid.keys)
     sweep = {
-        Cell(spec, seed): {column: display_value(value), "seed": seed}
-        for value, spec in specs.items()
+        Cell(spec, seed): {**dict(zip(columns, map(display_value, varied), strict=True)), "seed": seed}
+        for varied, spec in grid.specs.items()
         for seed in chosen_seeds
     }
     if dry_run:
@@ -136,20 +149,38 @@ def ablate(
         return
     rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
     if sys.stdout.isatty() and not is_interrupted(rows):
-        _point_to_figures(name, environment, db)
+        _point_to_figures(names, grid.keys, next(iter(grid.specs.values())), db)
     finish(sweep, rows)
 
 
 class AblateAlias(TyperCommand):
-    """The command `ablate-beta`: `ablate` without its argument NAME, which is "beta"."""
+    """The command `ablate-beta`: `ablate` without its argument, which is "beta"."""
 
     def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
-        super().__init__(name, params=[item for item in params if item.name != "name"], **settings)
+        super().__init__(name, params=[item for item in params if item.name != "names"], **settings)
 
     def invoke(self, ctx: Any) -> Any:
         """Run `ablate` with the name of the ablation."""
-        ctx.params["name"] = str(self.name).removeprefix("ablate-")
+        ctx.params["names"] = [str(self.name).removeprefix("ablate-")]
         return super().invoke(ctx)
+
+
+def _axes(names: Sequence[str], values: Sequence[str]) -> "list[Axis]":
+    """Return what varies: names with their --values in turn, and KEY=V1,V2. Raises InputError where the two differ."""
+    from ssmail.config.experiments import Axis
+
+    bare = [name for name in names if "=" not in name]
+    if values and len(values) != len(bare):
+        raise InputError(
+            f"--values is given {counted(len(values), 'time')} for {counted(len(bare), 'name')}; give it once for "
+            "each, in the same order, or write KEY=V1,V2."
+        )
+    rest, axes = iter(values), []
+    for name in names:
+        key, equals, given = name.partition("=")
+        text = given if equals else next(rest, None)
+        axes.append(Axis(key.strip(), None if text is None else parse_values(text)))
+    return axes
 
 
 def parse_values(text: str) -> list[Any]:
@@ -165,32 +196,38 @@ def parse_values(text: str) -> list[Any]:
         values = strict_yaml.parse(f"[{text}\n]")  # the line ends a comment, which would hide the bracket
     except yaml.YAMLError:
         values = None
-    if not values or None in values or text.rstrip().endswith(","):
+    if not values or text.rstrip().endswith(","):
         raise InputError(
             f"--values takes values with commas between them, such as 0,0.15,1, not '{shortened(text, 60)}'."
         )
     return list(values)
 
 
-def _column(key: str) -> str:
-    """Return the heading of the varied key: its last part, or all of it where that is the name of another column."""
+def _columns(keys: Sequence[str]) -> list[str]:
+    """Return the heading of each varied key: its last part, or all of it where another column has that name."""
     from ssmail.store import RunRow
 
-    last = key.rpartition(".")[2]
+    last = [key.rpartition(".")[2] for key in keys]
     taken = {"name", "run", "outcome", "action", "message", *(field.name for field in fields(RunRow))}
-    return key if last in taken else last
+    return [key if part in taken or last.count(part) > 1 else part for key, part in zip(keys, last, strict=True)]
 
 
-def _point_to_figures(name: str, environment: str | None, db: str) -> None:
-    """Print the command for each figure that draws the ablation on that environment."""
-    from ssmail.config.experiments import ablation, figure_requirements
+def _point_to_figures(names: Sequence[str], keys: Sequence[str], trained: "RunSpec", db: str) -> None:
+    """Print the command for each figure of the paper that draws these runs, else the one that draws any ablation."""
+    from ssmail.config.experiments import DEFAULT_ENVIRONMENT, DEFAULT_METHOD, figure_requirements
     from ssmail.config.experiments_file import load_experiments
 
-    trained = ablation(name, environment).environment
-    database = () if db == options.DEFAULT_DATABASE else ("--db", db)
+    commands = []
     for figure in load_experiments().figures:
         needed = figure_requirements(figure)
-        own = needed.environment == trained
-        if figure in FIGURES and needed.ablation == name and (own or FIGURES[figure].has_environment):
-            where = () if own else ("--env", trained)
-            note(f"`{command_line('ssmail', 'plot', figure, *where, *database)}` draws these runs")
+        own = needed.environment == trained.environment
+        drawn = [needed.ablation] == list(names) and trained.method in needed.methods
+        if figure in FIGURES and drawn and (own or FIGURES[figure].has_environment):
+            commands.append((figure, *(() if own else ("--env", trained.environment))))
+    if not commands:
+        where = ("--env", trained.environment) if trained.environment != DEFAULT_ENVIRONMENT else ()
+        which = ("--method", trained.method) if trained.method != DEFAULT_METHOD else ()
+        commands.append(("ablation", *(word for key in keys for word in ("--key", key)), *which, *where))
+    database = () if db == options.DEFAULT_DATABASE else ("--db", db)
+    for command in commands:
+        note(f"`{command_line('ssmail', 'plot', *command, *database)}` draws these runs")

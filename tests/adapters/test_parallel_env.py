@@ -11,7 +11,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 from ssmail.adapters.collecting import expert_set
 from ssmail.adapters.parallel_env import TrajectoryEnv
-from ssmail.config.sections import LettersSpec, YJunctionSpec
+from ssmail.config.data_sections import LettersSpec, YJunctionSpec
 from ssmail.data import letters, yjunction
 from ssmail.data.importing.dataset import ImportOptions
 from ssmail.data.mocap.dataset import NO_LINES, MocapParameters

@@ -256,3 +256,24 @@ def test_nothing_is_drawn_before_all_options_are_checked(
 )
 def test_what_does_not_go_together_is_said(cli: CommandLine, db: Path, arguments: str, sentence: str) -> None:
     assert sentence in cli("plot", *arguments.split(), "--db", db).sentence
+
+
+def test_an_ablation_of_any_key_is_drawn(cli: CommandLine, tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "ssmail.db")
+    for number, gamma in enumerate((0.5, 0.9)):
+        for batch in (2, 3):
+            spec = build_spec("ssail", "yjunction", "smoke", [f"sac.gamma={gamma}", f"training.batch={batch}"])
+            writer = store.start_run(spec, 0, dataset_hash="d" * 64, device="cpu")
+            writer.final(3, {"test/mode_mse": 0.1 + number, "test/lane_balance": 0.25})
+            writer.finish(RunState.FINISHED)
+    options = ("--out", tmp_path / "figures", "--db", tmp_path / "ssmail.db")
+    one = cli("plot", "ablation", "--key", "sac.gamma", "--where", "training.batch=2", *options)
+    assert one.out.splitlines()[-1] == str(tmp_path / "figures" / "ablation_sac.gamma_test-mode_mse.csv")
+    assert "profile smoke + training.batch=2), 2 values of sac.gamma" in one.err
+    words = ("--key", "sac.gamma", "--key", "training.batch", "--metric", "test/lane_balance", "--format", "svg")
+    (figure, _) = cli("plot", "ablation", *words, *options).out.splitlines()
+    assert provenance.read(Path(figure)).options["keys"] == ["sac.gamma", "training.batch"]
+    assert cli("explain", figure, "--db", tmp_path / "ssmail.db").code == 0
+    absent = cli("plot", "ablation", "--key", "beta", *options)
+    assert "differ in curriculum.beta alone; others differ in sac.gamma, training.batch; train some" in absent.sentence
+    assert "no option --metrik" in cli("plot", "ablation", "--metrik", "x", "--key", "beta", *options).sentence

@@ -112,6 +112,11 @@ def test_runs_are_named_by_their_first_digits(runs: CommandLine, filled: dict[st
         (["show", "zzzz"], "no run id starts with 'zzzz'"),
         (["compare", "--metric", "test/nothing"], "no run compared here has a metric 'test/nothing'"),
         (["export", "--format", "table"], "an export is csv or json, not a table"),
+        (["export", "--format", "latex"], "an export is csv or json, not a table"),
+        (["list", "--where", "gamma=1"], "no run here has a key or metric 'gamma'; did you mean sac.gamma?"),
+        (["compare", "--where", "sac.gamma"], "'sac.gamma' is no condition; write one as "),
+        (["list", "--sort", "mode_mse"], "no run here has a key or metric 'mode_mse'; did you mean test/mode_mse?"),
+        (["list", "--descending"], "--descending is for --sort; name what to sort by"),
         (["export", "--out", "/proc/none.csv"], "/proc/none.csv cannot be written"),
     ],
 )
@@ -124,11 +129,115 @@ def test_a_table_has_short_ids_and_fits_80_columns(
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     lines = runs("list", "--format", "table").out.splitlines()
-    assert len(lines) == 1 + len(filled)  # nothing is folded
+    assert len(lines) == 2 + len(filled)  # nothing is folded
+    assert lines[-1] == "left out, as the terminal is narrow: spec, start (UTC)"
     assert max(map(len, lines)) <= 80
+    assert "smoke + sac.gamma=0.5" in lines[4]
     assert filled["plain 1"][:8] in lines[2]
     assert filled["plain 1"][:9] not in lines[2]
     assert "0.006" in lines[2]
+
+
+def test_a_changed_spec_is_told_wherever_a_run_is_shown(runs: CommandLine, filled: dict[str, str]) -> None:
+    rows = runs("list").rows
+    assert [row["settings"] for row in rows] == ["smoke"] * 3 + ["smoke + sac.gamma=0.5"] * 2
+    assert [row["changes"] for row in rows[2:4]] == ["{}", '{"sac.gamma": 0.5}']
+    shown = {row["name"]: row["value"] for row in runs("show", filled["other 0"]).rows if row["section"] == "run"}
+    assert (shown["profile"], shown["settings"], shown["changes.sac.gamma"]) == (
+        "smoke",
+        "smoke + sac.gamma=0.5",
+        "0.5",
+    )
+    table = runs("compare", "--format", "table").out
+    (plain, other) = (line for line in table.splitlines() if line.startswith("ssail on "))
+    assert f"profile smoke, spec {build_spec('ssail', 'yjunction', 'smoke').hash()[:8]}, sac.gamma=0.95" in plain
+    assert "profile smoke + sac.gamma=0.5, spec " in other
+    assert other.count("0.5") == 1
+    assert {item["settings"] for item in json.loads(runs("compare", "--json").out)} == {
+        "smoke",
+        "smoke + sac.gamma=0.5",
+    }
+
+
+def listed(outcome: Any, names: dict[str, str]) -> list[str]:
+    found = {run_id: name for name, run_id in names.items()}
+    return [found[row["id"]] for row in outcome.rows]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--where", "sac.gamma=0.5"], ["other 0", "other 1"]),
+        (["--where", "sac.gamma!=0.5", "--where", "test/mode_mse<0.01"], ["plain 0", "plain 1"]),
+        (["--where", "test/mode_mse>0", "--sort", "-test/mode_mse"], ["other 0", "plain 2", "plain 1", "plain 0"]),
+        (["--sort", "test/mode_mse", "--descending", "--limit", "2"], ["other 0", "plain 2"]),
+        (["--limit", "2"], ["other 0", "other 1"]),
+        (["--where", "seed=0", "--sort", "sac.gamma"], ["other 0", "plain 0"]),
+    ],
+)
+def test_conditions_order_and_limit(
+    runs: CommandLine, filled: dict[str, str], options: list[str], expected: list[str]
+) -> None:
+    assert listed(runs("list", *options), filled) == expected
+
+
+def test_what_is_named_has_a_column(runs: CommandLine, filled: dict[str, str]) -> None:
+    options = ("--where", "sac.gamma<0.9", "--sort", "test/on_path", "--where", "seed<5")
+    (first, _) = rows = runs("list", *options).rows
+    assert (first["sac.gamma"], first["test/on_path"]) == ("0.5", "0.1")
+    assert [row["sac.gamma"] for row in rows] == ["0.5", "0.5"]
+    (heads, *_) = runs("list", *options, "--format", "markdown").out.splitlines()
+    assert "| gamma | test/on\\_path | mode\\_mse |" in heads
+
+
+def test_specs_are_compared_in_order(runs: CommandLine, filled: dict[str, str]) -> None:
+    def gammas(*options: str) -> list[float]:
+        found = json.loads(runs("compare", "--metric", "test/on_path", *options, "--json").out)
+        return [item["differs"].get("sac.gamma", "alone") for item in found]
+
+    assert gammas() == [0.95, 0.5]
+    assert gammas("--sort", "-test/mode_mse") == gammas("--sort", "sac.gamma") == [0.5, 0.95]
+    assert gammas("--sort", "sac.gamma", "--limit", "1") == gammas("--where", "sac.gamma=0.5") == ["alone"]
+    seeds = json.loads(runs("compare", "--where", "seed!=1", "--metric", "test/on_path", "--json").out)[0]["seeds"]
+    assert list(seeds) == ["0", "2"]
+
+
+def test_tables_for_documents(runs: CommandLine, filled: dict[str, str], add: AddRun) -> None:
+    add(0, 0.03, method="dnri")
+    options = ("--metric", "test/mode_mse", "--where", "seed<2")
+    spec = build_spec("dnri", "yjunction", "smoke").hash()[:8]
+    assert runs("compare", *options, "--format", "markdown").out.splitlines() == [
+        "| spec | seeds | test/mode\\_mse |",
+        "| --- | --- | --- |",
+        "| ssail gamma 0.95 | 2/2 | 0.005 ± 0.0014 |",
+        "| ssail gamma 0.5 | 1/2 | 0.1 |",
+        f"| dnri {spec} | 1/1 | 0.03 |",
+    ]
+    assert runs("compare", *options, "--format", "latex").out.splitlines() == [
+        r"\begin{tabular}{lll}",
+        r"\toprule",
+        r"spec & seeds & test/mode\_mse \\",
+        r"\midrule",
+        r"ssail gamma 0.95 & 2/2 & 0.005 $\pm$ 0.0014 \\",
+        r"ssail gamma 0.5 & 1/2 & 0.1 \\",
+        rf"dnri {spec} & 1/1 & 0.03 \\",
+        r"\bottomrule",
+        r"\end{tabular}",
+    ]
+
+
+def test_text_of_others_is_no_markup_in_a_document(runs: CommandLine, store: Store, add: AddRun) -> None:
+    run_id = add(0, 0.1)
+    with sqlite3.connect(store.where) as connection:
+        odd = r"x|<b>*_`[l](u)\input{y}%&#$^~"
+        connection.execute("UPDATE run SET host = ? WHERE id = ?", (odd, run_id))
+    (line,) = (line for line in runs("show", run_id, "--format", "markdown").out.splitlines() if "| host |" in line)
+    cell = r"x\|\<b\>\*\_\`\[l\](u)\\input\{y\}%\&\#\$^\~"
+    assert line == f"| run | host | - | {cell} |"
+    (row,) = (line for line in runs("show", run_id, "--format", "latex").out.splitlines() if "run & host &" in line)
+    for command in (r"\input", "%&", "#$", " ^"):
+        assert command not in row
+    assert r"\textbackslash input\{y\}\%\&\#\$" in row
 
 
 def test_show_tells_everything(runs: CommandLine, filled: dict[str, str]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ssmail.config.sections import YJunctionSpec
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.data import expert_sets, yjunction
 from ssmail.data.mocap.dataset import MocapParameters, prepare
 from ssmail.data.trajectories import ExpertSet

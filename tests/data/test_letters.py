@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from ssmail.config.data_sections import MOST_LETTERS, LettersSpec
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import MOST_LETTERS, LettersSpec
 from ssmail.data import letters
 
 

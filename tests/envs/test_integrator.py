@@ -2,7 +2,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.config.sections import YJunctionSpec
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.data.scaling import Scaling
 from ssmail.data.yjunction import generate
 from ssmail.envs.integrator import Integrator

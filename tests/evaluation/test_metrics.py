@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.config.sections import YJunctionSpec
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.data.yjunction import generate
 from ssmail.evaluation import metrics
 from ssmail.evaluation.metrics import lane_metrics, lane_test_metrics, one_step_mse

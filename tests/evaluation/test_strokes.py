@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ssmail.config.sections import LettersSpec
+from ssmail.config.data_sections import LettersSpec
 from ssmail.data import letters
 from ssmail.data.trajectories import Floats
 from ssmail.evaluation.metrics import polyline_distances, stroke_distances

@@ -20,8 +20,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ssmail.config.data_sections import LettersSpec, YJunctionSpec
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import LettersSpec, YJunctionSpec
 from ssmail.data import expert_sets, letters, npz_file, yjunction
 from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import SPLITS, ExpertSet, Trajectories

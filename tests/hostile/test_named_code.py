@@ -34,6 +34,8 @@ READING = (
     "runs list --figure fig6",
     "runs show {run}",
     "runs compare",
+    "runs list --where self_supervision.label=identity --sort self_supervision.label",
+    "plot ablation --key self_supervision.label --metric validation/mode_mse --out {folder}/figures",
     "runs export --out {folder}/all.csv",
     "db info",
     "db check",

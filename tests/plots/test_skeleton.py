@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, ImageChops
 
-from ssmail.config.sections import YJunctionSpec
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.data import expert_sets, yjunction
 from ssmail.data.mocap.dataset import NO_LINES, MocapParameters
 from ssmail.data.trajectories import ExpertSet, Trajectories

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.config.experiments import build_spec
-from ssmail.config.sections import YJunctionSpec
 from ssmail.data.yjunction import generate
 from ssmail.evaluation.metrics import lane_test_metrics
 from ssmail.store import RunState, Store

@@ -1,10 +1,11 @@
-"""Specs built from experiments.yaml: that of a run, and those of an ablation.
+"""Specs built from experiments.yaml: that of a run, those of an ablation, and those of a grid of values of any keys.
 
 `ssmail.config.experiments_file` lists the layers that they are merged from.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import product
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,11 +24,14 @@ from ssmail.config.spec import (
     check_keys,
     check_section,
     explain,
+    nearest_key,
     required_sections,
 )
 from ssmail.config.user_functions import UserFunction, search_folders
 from ssmail.errors import InputError, shortened, suggestion
 
+DEFAULT_METHOD, DEFAULT_ENVIRONMENT = "ssail", "yjunction"  # of a command that names none
+MOST_SPECS = 1000  # in a grid
 _LABEL = "self_supervision.label"
 _SHOWN = 80  # characters of an argument in a message
 
@@ -40,6 +44,20 @@ class Ablation(NamedTuple):
     environment: str
     key: str  # dotted, such as curriculum.beta
     values: tuple[Any, ...]  # lists are tuples (see `to_tuples`)
+
+
+class Axis(NamedTuple):
+    """One side of a grid: the name of an ablation or a dotted key, and its values; None: those of the ablation."""
+
+    name: str
+    values: Sequence[Any] | None = None
+
+
+class Grid(NamedTuple):
+    """The specs for every combination of values of some keys; the values are in the order of the keys."""
+
+    keys: tuple[str, ...]  # dotted
+    specs: dict[tuple[Any, ...], RunSpec]
 
 
 class FigureRequirements(NamedTuple):
@@ -64,6 +82,18 @@ def build_spec(
     source: the place of the overrides, as messages name it. Raises InputError, one sentence, for an unknown name or key
     (with a suggestion), a value of the wrong type or out of range, and a file that cannot be read.
     """
+    return explained_spec(method, environment, profile, overrides, file, source)[0]
+
+
+def explained_spec(
+    method: str,
+    environment: str,
+    profile: str,
+    overrides: Sequence[str] = (),
+    file: Path | None = None,
+    source: str = "--set",
+) -> tuple[RunSpec, dict[str, str]]:
+    """Return the spec that `build_spec` builds, and the place that the value of each dotted key comes from."""
     experiments = load_experiments(file)
     layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
     layers += _override_layers(overrides, method, environment, source)
@@ -91,20 +121,51 @@ def ablation_specs(
     The value is the strongest layer. The keys are the values as the specs hold them. Raises InputError as build_spec
     does (the source of a wrong value is --values or the file), and for an override of the ablation's key.
     """
+    load_experiments(file).entry("ablation", name)
+    grid = grid_specs([Axis(name, values)], profile, overrides, file, environment=environment)
+    return {value: spec for (value,), spec in grid.specs.items()}
+
+
+def grid_specs(
+    axes: Sequence[Axis],
+    profile: str,
+    overrides: Sequence[str] = (),
+    file: Path | None = None,
+    method: str | None = None,
+    environment: str | None = None,
+) -> Grid:
+    """Return the specs for all combinations of the values of some keys. Equal combinations count once.
+
+    Ablations among the axes add their settings; method and environment are theirs by default. The values are the
+    strongest layer, and the keys of the result hold them as the specs do. Raises InputError as `ablation_specs` does,
+    for ablations of different methods or environments, and for a key that is varied twice.
+    """
     experiments = load_experiments(file)
-    _, method, environment, key, own_values = _read_ablation(experiments, name, environment)
+    named = [_read_ablation(experiments, axis.name, environment) for axis in axes if axis.name in experiments.ablations]
+    method = method or _common("method", [found.method for found in named], DEFAULT_METHOD)
+    environment = environment or _common("env", [found.environment for found in named], DEFAULT_ENVIRONMENT)
     layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
-    layers += experiments.layers(ABLATION_LAYERS, ablation=name, profile=profile)
+    for found in named:
+        layers += experiments.layers(ABLATION_LAYERS, ablation=found.name, profile=profile)
     override_layers = _override_layers(overrides, method, environment, "--set")
-    if any(key in flatten(layer.values) for layer in override_layers):
-        raise InputError(f"{key} is what the ablation {name} varies; give its values with --values, not --set.")
-    source = f"ablations.{name} of {experiments.path.name}" if values is None else "--values"
-    specs: dict[Any, RunSpec] = {}
-    for value in own_values if values is None else values:
-        varied = Layer(source, _nested(key, value))
-        spec = _merge_layers(experiments, [*layers, *override_layers, varied], method, environment, profile)
-        specs[attrgetter(key)(spec)] = spec
-    return specs
+    overridden = {key for layer in override_layers for key in flatten(layer.values)}
+    sides: dict[str, list[Layer]] = {}
+    for axis in axes:
+        key, side = _side(experiments, axis, {found.name: found for found in named}, method, environment)
+        if key in overridden:
+            what = f"the ablation {axis.name}" if axis.name != key else "the command"
+            raise InputError(f"{key} is what {what} varies; give its values with --values, not --set.")
+        if key in sides:
+            raise InputError(f"{key} is varied twice; give all of its values at once.")
+        sides[key] = side
+    combinations = list(product(*sides.values()))
+    if len(combinations) > MOST_SPECS:
+        raise InputError(f"{len(combinations)} combinations of values are more than {MOST_SPECS}; give fewer values.")
+    specs: dict[tuple[Any, ...], RunSpec] = {}
+    for varied in combinations:
+        spec, _ = _merge_layers(experiments, [*layers, *override_layers, *varied], method, environment, profile)
+        specs[tuple(attrgetter(key)(spec) for key in sides)] = spec
+    return Grid(tuple(sides), specs)
 
 
 def figure_requirements(name: str, file: Path | None = None) -> FigureRequirements:
@@ -138,8 +199,8 @@ def display_value(value: Any) -> Any:
 
 def _merge_layers(
     experiments: Experiments, layers: Iterable[Layer], method: str, environment: str, profile: str
-) -> RunSpec:
-    """Return the spec of these layers, weakest first."""
+) -> tuple[RunSpec, dict[str, str]]:
+    """Return the spec of these layers, weakest first, and the source of each dotted key."""
     merged: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for layer in layers:
@@ -153,9 +214,39 @@ def _merge_layers(
     if function := UserFunction.parse(flatten(merged).get(_LABEL)):
         merged = merge(merged, _nested(_LABEL, function.with_digest(search_folders(experiments.path))))
     try:
-        return RunSpec.model_validate({**merged, "method": method, "environment": environment, "profile": profile})
+        spec = RunSpec.model_validate({**merged, "method": method, "environment": environment, "profile": profile})
     except ValidationError as error:
         raise InputError(explain(error, sources, str(experiments.path))) from None
+    return spec, sources
+
+
+def _common(option: str, found: Sequence[str], default: str) -> str:
+    """Return what all of the ablations have, the default without any. Raises InputError if they differ."""
+    if len(set(found)) > 1:
+        raise InputError(f"these ablations are of {' and '.join(dict.fromkeys(found))}; choose one with --{option}.")
+    return found[0] if found else default
+
+
+def _side(
+    experiments: Experiments, axis: Axis, named: Mapping[str, Ablation], method: str, environment: str
+) -> tuple[str, list[Layer]]:
+    """Return the key of an axis, and a layer for each of its values."""
+    if found := named.get(axis.name):
+        key, values, source = found.key, found.values, f"ablations.{axis.name} of {experiments.path.name}"
+        check_section(key, method, environment, source)
+    else:
+        key, values, source = axis.name, (), "--values"
+        if "." not in key:
+            raise InputError(
+                f"unknown ablation or key '{shortened(key, 60)}'; {nearest_key(key, experiments.ablations)}"
+            )
+        check_keys({key: None}, source)
+        check_section(key, method, environment, source)
+    if axis.values is not None:
+        values, source = tuple(axis.values), "--values"
+    if not values:
+        raise InputError(f"{key} has no values of its own; give them with --values.")
+    return key, [Layer(source, _nested(key, value)) for value in values]
 
 
 def _read_ablation(experiments: Experiments, name: str, environment: str | None) -> Ablation:

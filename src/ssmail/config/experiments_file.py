@@ -4,16 +4,22 @@ A spec is merged from LAYERS, and later ones win. Each layer is a path in the fi
 `defaults` come first, then `environments.mocap`, `methods.ssail` and `environments.mocap.methods.ssail`; then
 `profiles.paper` and what it contains for the environment, for the method, and for the two together. The specs of an
 ablation add ABLATION_LAYERS. Overrides (--set) come last. A path that the file does not have is an empty layer.
+
+One file is in use: the one that $SSMAIL_EXPERIMENTS names, else the experiments.yaml of the current folder, else the
+one shipped with ssmail. That of the current folder is announced in the log, because nobody asked for it by name; for
+the same reason it may not name Python functions, which would let a folder of someone else run code.
 """
 
 import functools
+import logging
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssmail.config import strict_yaml
+from ssmail.config.shaping import FUNCTION
 from ssmail.errors import InputError, shortened, suggestion, unknown_name
 
 LAYERS = (
@@ -29,10 +35,11 @@ LAYERS = (
 )
 ABLATION_LAYERS = ("ablations.{ablation}.settings", "profiles.{profile}.ablations.{ablation}")
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
-_FILE_NAME = "experiments.yaml"
+FILE_NAME = "experiments.yaml"
 PACKAGE = Path(__file__).resolve().parents[1]
 """The folder of ssmail itself, where an installation has its experiments.yaml."""
 Mappings = Mapping[str, Mapping[str, Any]]
+_LOG = logging.getLogger(__name__)
 
 
 class Layer(NamedTuple):
@@ -42,7 +49,7 @@ class Layer(NamedTuple):
     values: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Experiments:
     """The sections of one experiments.yaml. The values in them are not validated yet."""
 
@@ -88,11 +95,16 @@ class Experiments:
 def load_experiments(file: Path | None = None) -> Experiments:
     """Read an experiments.yaml: `file`, or the one that `find_file` returns.
 
-    Unless its content has changed, a file is parsed once in the life of the process. Raises InputError for a file that
-    is missing, is not YAML (with the line), or lacks a section of Experiments.
+    Unless its content has changed, a file is parsed once in the life of the process, and the same object is returned.
+    Raises InputError for a file that is missing, is not YAML (with the line), or lacks a section of Experiments, and
+    for one that was only found in the current folder and names a Python function.
     """
     path = file or find_file()
-    return _parsed(path, strict_yaml.read_bytes(path, strict_yaml.MOST_BYTES))
+    found = _parsed(path, strict_yaml.read_bytes(path, strict_yaml.MOST_BYTES))
+    if file is None and is_local(path):
+        _check_names_no_code(found)
+        _announce(path)
+    return found
 
 
 @functools.lru_cache(maxsize=4)
@@ -111,11 +123,49 @@ def _parsed(path: Path, source: bytes) -> Experiments:
 
 
 def find_file() -> Path:
-    """Return the path in $SSMAIL_EXPERIMENTS, or the file shipped with the package, or that of the checkout."""
+    """Return the path of the file in use: that of $SSMAIL_EXPERIMENTS, of the current folder, or of ssmail."""
     if os.environ.get(ENVIRONMENT_VARIABLE):
         return Path(os.environ[ENVIRONMENT_VARIABLE])
-    packaged, checkout = PACKAGE / _FILE_NAME, PACKAGE.parents[1] / _FILE_NAME
+    shipped = shipped_file()
+    if not os.path.lexists(FILE_NAME):
+        return shipped
+    local = Path.cwd() / FILE_NAME
+    return shipped if local.exists() and local.samefile(shipped) else local
+
+
+def shipped_file() -> Path:
+    """Return the path of the file that is installed with ssmail, or that of the checkout."""
+    packaged, checkout = PACKAGE / FILE_NAME, PACKAGE.parents[1] / FILE_NAME
     return packaged if packaged.exists() else checkout
+
+
+def is_local(path: Path) -> bool:
+    """Return whether the file in use is in use only because it lies in the current folder."""
+    return not os.environ.get(ENVIRONMENT_VARIABLE) and path != shipped_file()
+
+
+@functools.cache
+def _announce(path: Path) -> None:
+    _LOG.warning("%s of the current folder is in use, not the one of ssmail", path)
+
+
+def _check_names_no_code(experiments: Experiments) -> None:
+    """Raise InputError if any text of the file has the form module:function."""
+    for text in _texts([getattr(experiments, field.name) for field in fields(experiments) if field.name != "path"]):
+        if FUNCTION.fullmatch(text):
+            raise InputError(
+                f"{experiments.path} names Python code, {shortened(text, 60)}, which a file that was only found in the "
+                f"current folder may not; if it is yours, set {ENVIRONMENT_VARIABLE}={FILE_NAME}."
+            )
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Yield every text within nested mappings and lists, keys excepted."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping | list):
+        for part in value.values() if isinstance(value, Mapping) else value:
+            yield from _texts(part)
 
 
 def merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,14 +7,15 @@ import difflib
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import Any, Self, get_args
 
 from pydantic import BaseModel, ValidationError, model_validator
 
-from ssmail.config import sections, strict_yaml
+from ssmail.config import data_sections, sections, strict_yaml
 from ssmail.config.names import ENVIRONMENTS, METHODS, Environment, Method
+from ssmail.config.value_types import Frozen
 from ssmail.errors import InputError, shortened
 
 _ADVERSARIAL = ("model", "adversarial", "sac", "curriculum", "training")
@@ -61,16 +62,16 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     *(("forecast", key, None) for key in ("miss_distance", "collision_distance")),
     *(("evaluation", key, None) for key in ("validation_windows", "validation_samples")),
 )
-_ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
+ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
 
 
-class RunSpec(sections.Frozen):
+class RunSpec(Frozen):
     """Everything that defines a run except its seed. Sections that it does not use are null (see METHOD_SECTIONS)."""
 
     method: Method
     environment: Environment
     profile: str
-    data: sections.DataSpec
+    data: data_sections.DataSpec
     model: sections.ModelSpec | None
     adversarial: sections.AdversarialSpec | None
     self_supervision: sections.SelfSupervisionSpec | None
@@ -144,9 +145,9 @@ def check_keys(given: Mapping[str, Any], source: str) -> None:
 
     source: the place of the keys, as messages name it.
     """
-    is_section = _spec_keys(RunSpec)
+    is_section = spec_keys()
     for key, value in given.items():
-        if key in _ARGUMENTS:
+        if key in ARGUMENTS:
             raise InputError(f"'{key}' in {source} cannot be set there; give it with --{key.removesuffix('ironment')}.")
         if key not in is_section:
             raise InputError(f"unknown key '{shortened(key, 60)}' in {source}; {_suggest_key(key, is_section)}")
@@ -191,15 +192,36 @@ def explain(error: ValidationError, sources: Mapping[str, str], file: str) -> st
     return f"{key} = {strict_yaml.inline(first['input'])}{source} should be {kinds.get(expected, expected)}."
 
 
-def _spec_keys(model: type[BaseModel], prefix: str = "") -> dict[str, bool]:
+def spec_keys() -> dict[str, bool]:
     """Return whether each dotted key that can be set is a section."""
+    return _keys_of(RunSpec)
+
+
+def nearest_key(name: str, others: Iterable[str] = ()) -> str:
+    """The end of a message about an unknown name: the nearest of `others` and the keys, by their last part as well."""
+    values = [key for key, is_section in spec_keys().items() if not is_section]
+    close = [key for key in values if key.rpartition(".")[2] == name] or difflib.get_close_matches(name, others, n=1)
+    by_last = {key.rpartition(".")[2]: key for key in reversed(values)}
+    close = close or [key for key in values if key.startswith(f"{name}.")]
+    close = close or [by_last[last] for last in difflib.get_close_matches(name, by_last, n=1)]
+    if close:
+        return f"did you mean {' or '.join(close[:3])}?"
+    return f"choose from {', '.join(others)}, or a key such as sac.gamma."
+
+
+def section_of(annotation: Any) -> type[Frozen] | None:
+    """Return the class of a section from its annotation `Section` or `Section | None`; None for any other key."""
+    kinds = get_args(annotation) or (annotation,)
+    return next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, Frozen)), None)
+
+
+def _keys_of(model: type[BaseModel], prefix: str = "") -> dict[str, bool]:
     keys: dict[str, bool] = {}
     for name, field in model.model_fields.items():
-        kinds = get_args(field.annotation) or (field.annotation,)  # of `Section`, or of `Section | None`
-        section = next((kind for kind in kinds if isinstance(kind, type) and issubclass(kind, BaseModel)), None)
-        if prefix or name not in _ARGUMENTS:
+        section = section_of(field.annotation)
+        if prefix or name not in ARGUMENTS:
             keys[f"{prefix}{name}"] = section is not None
-        keys |= _spec_keys(section, f"{prefix}{name}.") if section else {}
+        keys |= _keys_of(section, f"{prefix}{name}.") if section else {}
     return keys
 
 

@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from ssmail.config.data_sections import DataSpec, LettersSpec, YJunctionSpec
 from ssmail.config.foreign_files import ARCHIVE_ERRORS, open_regular
-from ssmail.config.sections import DataSpec, LettersSpec, YJunctionSpec
 from ssmail.data import letters, yjunction
 from ssmail.data.atomic_file import atomic_write
 from ssmail.data.mocap import dataset as mocap

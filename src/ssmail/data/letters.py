@@ -26,7 +26,7 @@ from typing import Self
 import numpy as np
 
 from ssmail.config import strict_yaml
-from ssmail.config.sections import LettersSpec
+from ssmail.config.data_sections import LettersSpec
 from ssmail.data.trajectories import ExpertSet, Floats, Trajectories, generate_splits
 
 WIDTH, GAP = 0.8, 0.4  # of a letter and between letters

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from ssmail.config.sections import Frozen
+from ssmail.config.value_types import Frozen
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 
 LONGEST_NAME = 200  # characters of the name of a scene

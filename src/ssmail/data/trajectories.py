@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ssmail.config.sections import LettersSpec, YJunctionSpec
+from ssmail.config.data_sections import LettersSpec, YJunctionSpec
 from ssmail.data.scaling import Scaling, ends
 
 Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes

@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from ssmail.config.sections import YJunctionSpec
+from ssmail.config.data_sections import YJunctionSpec
 from ssmail.data.trajectories import ExpertSet, Floats, Integers, Trajectories, generate_splits
 from ssmail.errors import InputError
 

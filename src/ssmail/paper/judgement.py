@@ -7,7 +7,7 @@ from ssmail.errors import InputError, command_line, unknown_name
 from ssmail.paper.claims import Claim, Decision, Verdict, holm
 from ssmail.paper.results import CLAIMS, FIGURES, FigureModule
 from ssmail.paper.samples import Runs
-from ssmail.plots.run_groups import Selection
+from ssmail.plots.run_groups import Selection, settings_of
 from ssmail.store import Store
 
 FIRST_SEEDS = 5  # to train for a claim that has no runs yet
@@ -21,6 +21,7 @@ class Judgement:
     decision: Decision
     p_holm: float  # corrected over all eight claims
     profile: str | None  # of the runs; None without any
+    settings: str | None  # the profile with the changes to it that all of the runs have
     runs: tuple[str, ...]  # ids, each once
     notes: tuple[str, ...]  # which runs were chosen, and what is missing
     command: str  # trains what is missing or as many runs as should settle the claim; empty when there is nothing to do
@@ -70,9 +71,9 @@ def _decided(store: Store, figure: FigureModule, profile: str | None) -> tuple[R
 def _judgement(claim: Claim, runs: Runs, decision: Decision, p_holm: float, profile: str | None) -> Judgement:
     used = dict.fromkeys(run for part in decision.parts for sample in part.samples for run in sample.runs)
     chosen = runs.selection.runs
-    drawn = chosen[0].profile if chosen else None
+    drawn, settings = (chosen[0].profile, settings_of(chosen)) if chosen else (None, None)
     command = _command(claim, decision, drawn or profile or "quick")
-    return Judgement(claim, decision, p_holm, drawn, tuple(used), runs.selection.notes, command)
+    return Judgement(claim, decision, p_holm, drawn, settings, tuple(used), runs.selection.notes, command)
 
 
 def _command(claim: Claim, decision: Decision, profile: str) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, NamedTuple
 
+from ssmail.config.changes import with_changes
 from ssmail.config.experiments import to_tuples
 from ssmail.config.names import flatten
 from ssmail.errors import InputError
@@ -154,7 +155,7 @@ def choice_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
     others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
     unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
     seeds = ", ".join(str(run.seed) for run in group.runs)
-    note = f"{group.label}: spec {first.spec_hash[:8]} (profile {first.profile}), seeds {seeds}"
+    note = f"{group.label}: spec {first.spec_hash[:8]} (profile {first.settings}), seeds {seeds}"
     if not current:
         note += "; not the spec that experiments.yaml gives now"
     if others:
@@ -162,6 +163,13 @@ def choice_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
     if unfinished:
         note += f"; {counted(unfinished, 'unfinished run')} left out"
     return f"{note}."
+
+
+def settings_of(runs: Sequence[RunRow]) -> str:
+    """Return the profile of these runs, with the changes to it that all of them have: "quick + training.epochs=12"."""
+    first, *others = runs
+    shared = {k: v for k, v in first.changes.items() if all(run.changes.get(k, ABSENT) == v for run in others)}
+    return with_changes(first.profile, shared)
 
 
 def newest_of_each_seed(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:
@@ -175,9 +183,9 @@ def value_of(run: RunRow, key: str) -> Any:
     return to_tuples(flatten(run.spec).get(key, ABSENT))
 
 
-def rest_of(run: RunRow, key: str) -> str:
-    """Return the run's spec without the key, and without nulls, which earlier versions may have had no key for."""
-    values = {name: value for name, value in flatten(run.spec).items() if name != key and value is not None}
+def rest_of(run: RunRow, *keys: str) -> str:
+    """Return the run's spec without these keys, and without nulls, which earlier versions may have had no key for."""
+    values = {name: value for name, value in flatten(run.spec).items() if name not in keys and value is not None}
     return json.dumps(values, sort_keys=True)
 
 

@@ -43,6 +43,7 @@ from ssmail.plots.run_groups import (
     grouped,
     newest_of_each_seed,
     rest_of,
+    settings_of,
     value_of,
 )
 from ssmail.store import RunRow, Store
@@ -265,7 +266,7 @@ def _default_family(store: Store, needed: _Comparison, varied: Ablation, profile
     groups = _groups_of_values(varied, best.runs, newest_of_each_seed)
     seeds = sorted({run.seed for group in groups for run in group.runs})
     drawn_profile = best.runs[0].profile
-    note = f"ablation {varied.name}: runs of {varied.method} (profile {drawn_profile}), "
+    note = f"ablation {varied.name}: runs of {varied.method} (profile {settings_of(best.runs)}), "
     note += f"{counted(len(groups), 'value')}, seeds {', '.join(map(str, seeds))}"
     if not best.current:
         note += f"; they differ in {varied.key} alone, but are not what experiments.yaml gives now"

@@ -26,6 +26,7 @@ RESOLUTION = 300  # dots per inch of a PNG
 
 REFERENCE = "#222222"
 LANE = "#D4D4D4"
+STRIPE = "#F2F2F2"
 REACH = 3.0
 _LABEL = 120  # characters
 AGENTS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")

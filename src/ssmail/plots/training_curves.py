@@ -92,7 +92,7 @@ def collect(
     for metric in dict.fromkeys(metrics):
         values = store.metrics([run.id for run in runs], names=[metric])
         if not len(values):
-            raise _unknown_metric(store, runs, metric)
+            raise unknown_metric(store, runs, metric)
         groups, left_out = _groups(runs, values, group_by)
         for group in groups:
             check_one_data_set(NAME, group.runs)
@@ -112,7 +112,7 @@ def collect(
     )
 
 
-def _unknown_metric(store: Store, runs: Sequence[RunRow], metric: str) -> InputError:
+def unknown_metric(store: Store, runs: Sequence[RunRow], metric: str) -> InputError:
     """One sentence with the nearest stored names: those with the same last part first."""
     names = sorted(set(store.latest_metrics([run.id for run in runs])["name"]))
     if not names:

@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from ssmail.config.names import flatten
@@ -21,6 +21,7 @@ class Comparison:
     values: the metric's last value by seed; None if the newest run of that seed did not record it.
     states: the state of that run by seed. Runs in every state are included, diverged ones too.
     computed: how the values that the runs did not store were computed, in one sentence; None if all were stored.
+    changes: the dotted spec keys in which the spec differs from its profile, with its values; settings: both in words.
     """
 
     method: str
@@ -32,6 +33,8 @@ class Comparison:
     values: Mapping[int, float | None]
     states: Mapping[int, RunState]
     computed: str | None = None
+    changes: Mapping[str, Any] = field(default_factory=dict)
+    settings: str = ""
 
     @property
     def known(self) -> list[float]:
@@ -82,6 +85,8 @@ def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -
             values={run.seed: latest.get((run.id, metric)) for run in found},
             states={run.seed: run.state for run in found},
             computed=computed,
+            changes=found[0].changes,
+            settings=found[0].settings,
         )
         for spec, found in by_seed.items()
         for metric in metrics

@@ -11,6 +11,7 @@ from typing import Any
 
 from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, select
 
+from ssmail.config.changes import changes, with_changes
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
 from ssmail.store import schema
@@ -72,6 +73,16 @@ class RunRow:
     def spec(self) -> dict[str, Any]:
         """The spec as nested plain values, completed with the keys that were added after the run was stored."""
         return with_added_keys(json.loads(self.spec_json))
+
+    @cached_property
+    def changes(self) -> dict[str, Any]:
+        """The dotted keys in which the spec differs from its profile, with its values (see `ssmail.config.changes`)."""
+        return changes(self.spec)
+
+    @property
+    def settings(self) -> str:
+        """The profile, with the changes to it: "quick + training.epochs=12"."""
+        return with_changes(self.profile, self.changes)
 
     @property
     def silent_seconds(self) -> float:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from ssmail.config.sections import AdversarialSpec, Pairing, SelfSupervisionSpec, required
+from ssmail.config.sections import AdversarialSpec, SelfSupervisionSpec, required
 from ssmail.config.user_functions import load_label
+from ssmail.config.value_types import Pairing
 from ssmail.losses import Terms
 from ssmail.losses.adversarial import (
     gail_loss,

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from ssmail.config.sections import Frozen
+from ssmail.config.value_types import Frozen
 from ssmail.data.mocap.acclaim_lines import AGAIN
 from ssmail.data.mocap.amc import MOST_PLACES, parse_motion
 from ssmail.data.mocap.asf import Skeleton, parse_skeleton

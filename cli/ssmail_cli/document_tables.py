@@ -1,0 +1,38 @@
+"""Tables for documents: LaTeX (with the package booktabs) and Markdown.
+
+What stands in a cell may come from a file of someone else, so no text is read as a command, as markup or as HTML.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ssmail.errors import printable
+
+_MARKUP = re.compile(r"([\\`*_{}\[\]<>|~#&$])")
+
+
+def latex(cells: Sequence[Sequence[str]], headings: Sequence[str], numeric: Sequence[bool]) -> str:
+    """Return a tabular; columns of numbers are aligned to the right."""
+    import pandas as pd
+
+    frame = pd.DataFrame([list(map(printable, row)) for row in cells], columns=list(map(printable, headings)))
+    form = "".join("r" if right else "l" for right in numeric)
+    return frame.to_latex(index=False, escape=True, column_format=form).replace("±", r"$\pm$").rstrip("\n")
+
+
+def markdown(cells: Sequence[Sequence[str]], headings: Sequence[str], numeric: Sequence[bool]) -> str:
+    """Return a pipe table; columns of numbers are aligned to the right."""
+    rules = ["---:" if right else "---" for right in numeric]
+    return "\n".join(
+        f"| {' | '.join(row)} |" for row in (map(_marked, headings), rules, *(map(_marked, c) for c in cells))
+    )
+
+
+def is_numeric(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
+    """Return whether any row has a number under the key."""
+    return any(isinstance(row.get(key), int | float) for row in rows)
+
+
+def _marked(text: str) -> str:
+    return _MARKUP.sub(r"\\\1", printable(text))
