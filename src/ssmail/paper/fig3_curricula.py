@@ -143,4 +143,4 @@ def _length_axis(axes: Axes, record: CurriculaRecord) -> None:
     axes.yaxis.set_major_locator(FixedLocator([step * 10**power for power in range(4) for step in (1, 2, 5)]))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.set_ylabel("mean segment length (steps)")
+    axes.set_ylabel("mean segment length\n(steps, logarithmic scale)")

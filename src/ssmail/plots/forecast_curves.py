@@ -27,7 +27,7 @@ from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band
 from ssmail.plots.data_sets import DataSet
 from ssmail.plots.formatting import number
-from ssmail.plots.metric_units import label
+from ssmail.plots.metric_units import named
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection, tested_alike
 from ssmail.store import RunRow, RunState, Store
@@ -146,7 +146,7 @@ def draw(record: ForecastRecord) -> Figure:
         handles = [curves.draw_band(axes, shown, strokes[shown.label]) for shown in record.bands]
         handles += [_draw_reference(axes, name, errors) for name, errors in record.references.items()]
         style.step_axis(axes, record.steps)
-        axes.set_ylabel(label(f"test/{record.error}"))
+        axes.set_ylabel(named(record.error, "test"))
         title = f"{style.literal(record.data.name)}; {curves.legend_title(record.statistic)}"
         figure.legend(handles=handles, loc="outside upper center", ncols=columns, title=title)
         return figure
