@@ -109,14 +109,13 @@ Stat = Annotated[
     str | None,
     typer.Option("--stat", callback=known_statistic, help=f"Centre and band: {STATISTICS}.", show_default="mean-std"),
 ]
-_WITH_STATISTIC = {figure.name: figure.statistic for figure in FIGURES.values() if figure.has_statistic}
-_FIGURES_WITH_STATISTIC = list(_WITH_STATISTIC)
+_WITH_STATISTIC = list(dict.fromkeys(figure.name for figure in FIGURES.values() if figure.has_statistic))
 StatOfFigures = Annotated[
     str | None,
     typer.Option(
         "--stat",
         callback=known_statistic,
-        help=f"Centre and band of {', '.join(_FIGURES_WITH_STATISTIC[:-1])} and {_FIGURES_WITH_STATISTIC[-1]}: {STATISTICS}.",
+        help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
         show_default="median-iqr on logarithmic axes, else mean-std",
     ),
 ]

@@ -70,6 +70,18 @@ class StabilityRecord:
     provenance: Provenance
     notes: tuple[str, ...]
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        several = len(self.bands) > 1
+        words = curves.in_words(self.bands, self.statistic, runs=not several)
+        small = " The small panels show each run at the same scale." if several else ""
+        return (
+            "Training error on Y-Junction over epochs: the squared distance of sampled rollouts to the nearest of the "
+            f"expert's lanes, in squared scaled units. {words}{small} Dotted: "
+            "the test error of constant velocity, that is of driving straight on."
+        )
+
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, value, low, high].
 

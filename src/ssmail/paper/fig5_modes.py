@@ -95,6 +95,17 @@ class ModesRecord:
     provenance: Provenance
     notes: tuple[str, ...]
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        return (
+            "Sampled rollouts of the best-validation model of every seed on Y-Junction, from "
+            f"{STARTS} starts spread over the test split; a dot marks where an agent ends. Grey: all points within "
+            f"{ON_PATH_TOLERANCE:g} step length of a lane's centre line. Agents whose whole path stays there are blue, "
+            "the others orange. The numbers count what is shown: the share of such agents, and the rollouts that take "
+            "each lane."
+        )
+
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, lane, on_path, trajectory, agent, step, x, y].
 
@@ -102,7 +113,9 @@ class ModesRecord:
         that the rollout takes. on_path: 1 for an agent that stays on the path, 0 for one that leaves it.
         """
         lines = [
-            pd.DataFrame({"kind": "centre line", "lane": lane, "step": range(len(line)), "x": line[:, 0], "y": line[:, 1]})
+            pd.DataFrame(
+                {"kind": "centre line", "lane": lane, "step": range(len(line)), "x": line[:, 0], "y": line[:, 1]}
+            )
             for lane, line in enumerate(self.centre_lines)
         ]
         table = pd.concat([*lines, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)

@@ -105,6 +105,18 @@ class BetaRecord:
         """Whether the centre is another one, so that the means of the errors stand beside it."""
         return self.statistic.centre != "mean"
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        counts = sorted({len(column.error) for column in self.columns})
+        runs = " to ".join(map(str, dict.fromkeys([counts[0], counts[-1]])))
+        mean = ", and the mean as a diamond" if self.shows_means else ""
+        return (
+            "Test error of the best-validation model on Y-Junction against beta, the pace of trajectory forcing "
+            f"(above), and the share of its rollouts that take the rarer lane (below). Each dot is a run, {runs} for each "
+            f"value; beside them stand {self.statistic.words}{mean}. Dotted: constant velocity."
+        )
+
     def table(self) -> pd.DataFrame:
         """[kind, beta, run_id, seed, mode_mse, mode_mse_low, mode_mse_high, lane_balance, ..._low, ..._high].
 
@@ -233,9 +245,10 @@ def _draw_errors(axes: Axes, record: BetaRecord) -> list[Line2D]:
     line.set_label(record.statistic.words)
     handles = [Line2D([], [], color=POINTS, marker=".", ls="", ms=5, mew=0, label="one run"), line]
     if record.shows_means:
-        x, means = np.arange(len(record.columns)) + MEAN_ASIDE, [column.mean for column in record.columns]
+        places = np.arange(len(record.columns)) + MEAN_ASIDE
+        means = [column.mean for column in record.columns]
         look: dict[str, Any] = {"color": style.REFERENCE, "ls": "", "marker": "D", "ms": 3, "mfc": "white", "mew": 0.7}
-        handles += axes.plot(x, means, label="mean", gid="means", **look)
+        handles += axes.plot(places, means, label="mean", gid="means", **look)
     if diverged := sum(column.diverged for column in record.columns):
         count = sum(len(column.error) for column in record.columns)
         label = f"diverged, {diverged} of {count} runs"

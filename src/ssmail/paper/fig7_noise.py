@@ -142,6 +142,17 @@ class NoiseRecord:
     provenance: Provenance
     notes: tuple[str, ...]
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        leaving = any(panel.reference_leaves for panel in self.panels)
+        return (
+            "Test error of predicted motion against the predicted step, in squared scaled units, with clean input and "
+            f"with Gaussian noise (std {self.noise:g} scaled units) on what the model reads. "
+            f"{curves.in_words(self.panels[0].bands, self.statistic)} Dotted: constant velocity, given the same input"
+            f"{', which leaves the scale' if leaving else ''}."
+        )
+
     def table(self) -> pd.DataFrame:
         """[condition, kind, label, run_id, seed, step, value, low, high].
 

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.plots import style
+from ssmail.plots.formatting import listed
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.road import draw_strip
 from ssmail.plots.run_groups import Reads, Selection
@@ -39,6 +40,16 @@ class YJunctionRecord:
     fork: tuple[float, float]  # the last point that all centre lines share
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        steps = listed([str(step) for step in self.steps])
+        return (
+            "The Y-Junction: the road with its lanes, and the expert's first training trajectory on each lane, with "
+            f"its agents at steps {steps} (filled and open markers tell the lanes apart). The road is drawn twice as "
+            "wide as the expert's trajectories stray from the centre lines."
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, lane, agent, step, x, y]; kind: centre line (step counts its points), trajectory, agent, or fork."""

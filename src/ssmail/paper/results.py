@@ -105,7 +105,9 @@ _MODULES = (
     FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", statistic="median-iqr"),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
     FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", statistic="median-iqr"),
-    FigureModule("fig7", "noise", "mocap: test error against the predicted step, clean and noisy", statistic="mean-std"),
+    FigureModule(
+        "fig7", "noise", "mocap: test error against the predicted step, clean and noisy", statistic="mean-std"
+    ),
     FigureModule(
         "fig8", "alpha", "mocap: training over epochs for ranges of alpha", statistic="median-iqr", has_environment=True
     ),

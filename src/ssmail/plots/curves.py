@@ -225,6 +225,16 @@ def count_label(shown: Band) -> str:
     return f"{style.literal(shown.label)}: {counted(len(shown.curves), 'run')}{fate}"
 
 
+def in_words(bands: Sequence[Band], statistic: Statistic, runs: bool = True) -> str:
+    """Return the sentence of a caption on what line, band and, with `runs`, thin lines of these groups show."""
+    groups = [f"{len(shown.curves)} of {shown.label}" + _lost(shown) for shown in bands]
+    return f"Line and band: {statistic.words} over all runs ({', '.join(groups)})" + "; thin lines: runs" * runs + "."
+
+
+def _lost(shown: Band) -> str:
+    return f", of which {shown.diverged} diverged" if shown.diverged else ""
+
+
 def legend_title(statistic: Statistic, runs: bool = True) -> str:
     """Return a legend title that explains the thick line, the band and, with `runs`, the thin lines of `draw_band`."""
     return f"line and band: {statistic.words}" + "; thin: single runs" * runs
