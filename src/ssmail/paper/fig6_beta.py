@@ -113,8 +113,8 @@ class BetaRecord:
         mean = ", and the mean as a diamond" if self.shows_means else ""
         return (
             "Test error of the best-validation model on Y-Junction against beta, the pace of trajectory forcing "
-            f"(above), and the share of its rollouts that take the rarer lane (below). Each dot is a run, {runs} for each "
-            f"value; beside them stand {self.statistic.words}{mean}. Dotted: constant velocity."
+            "(above), and the share of its rollouts that take the rarer lane (below). Each dot is a run, "
+            f"{runs} for each value; beside them stand {self.statistic.words}{mean}. Dotted: constant velocity."
         )
 
     def table(self) -> pd.DataFrame:
