@@ -67,7 +67,7 @@ def test_the_shown_starts_are_spread_over_all(store: Store, add_run: Any) -> Non
 
 def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: Path) -> None:
     strays = arrays()["test/rollouts"]
-    strays[0, 0, 3, 1] += 1.5  # the other agent and the other rollouts stay on the path
+    strays[0, 0, 3, 1, 1] += 1.5  # the other agent and the other rollouts stay on the path
     runs = [add_run(0), add_run(1, test__rollouts=strays)]
     record = FIGURES["fig5"].collect(store)
     figure = fig5_modes.draw(record)

@@ -43,7 +43,7 @@ def test_the_ranges_of_experiments_yaml_in_their_order(store: Store, vary_alpha:
 
 
 def test_mean_and_std_of_the_error_over_seeds(store: Store, runs: dict[Any, list[str]]) -> None:
-    record = FIGURES["fig8"].collect(store)
+    record = FIGURES["fig8"].collect(store, statistic=Statistic.MEAN_STD)
     positive, both = record.errors
     assert record.error == "train/mse"
     np.testing.assert_allclose(positive.summary.centre, [0.04, 0.02, 0.02])
@@ -78,7 +78,7 @@ def test_the_first_range_is_compared_with_the_others(store: Store, runs: dict[An
 
 def test_a_diverged_run_is_counted_and_shown(store: Store, vary_alpha: Any) -> None:
     (_, lost), _ = vary_alpha({POSITIVE: [0.01, None], BOTH: [0.001, 0.002]}).values()
-    record = FIGURES["fig8"].collect(store)
+    record = FIGURES["fig8"].collect(store, statistic=Statistic.MEAN_STD)
     assert [band.diverged for band in record.errors] == [1, 0]
     np.testing.assert_array_equal(np.isnan(record.errors[0].summary.centre), [False, True, True])
     figure = fig8_alpha.draw(record)

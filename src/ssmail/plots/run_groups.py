@@ -150,7 +150,7 @@ def fullest_profile(families: Mapping[str, Sequence[Family]]) -> str:
 
 
 def choice_note(figure: str, group: Group, current: bool, stored: Sequence[RunRow]) -> str:
-    """Say which spec `figure` draws of a method, and how many other specs and unfinished runs of `stored` it does not."""
+    """Say which spec `figure` draws of a method, and how many other specs and unfinished runs of `stored` it leaves."""
     first = group.runs[0]
     others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
     unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
