@@ -29,8 +29,8 @@ def explain(
     """Show which runs a saved figure is drawn from.
 
     Lists the runs behind each curve, with spec (and how the specs of a method differ), data and code of each. Also
-    collects the figure from the database again, and reports whether the runs and the values are still the same. Exit
-    code 1: they are not; 0: they are, or there is nothing to compare with.
+    collects the figure from the database again, and reports whether the runs and the values are still the same, numbers
+    to within a millionth. Exit code 1: they are not; 0: they are, or there is nothing to compare with.
     """
     from ssmail.paper.explanation import compare
     from ssmail.paper.explanation import explain as explain_figure
@@ -53,6 +53,7 @@ def _heading(found: "Explanation") -> list[str]:
     source = found.provenance
     about = "".join(f", {name} {short(value)}" for name, value in source.options.items())
     lines = [f"{found.path}: {source.figure}{about}; drawn with ssmail {source.drawn_with}"]
+    lines += [source.caption] if source.caption else []
     lines += [f"code of the runs: {', '.join(source.code)}"] if source.code else []
     lines += [f"data: {', '.join(source.dataset_hashes)}"] if source.dataset_hashes else []
     states = {"as written": "as it was written with the figure", "altered": "altered since", "missing": "missing"}
@@ -71,7 +72,8 @@ def _verdict(agreement: "Agreement | None", db: str) -> str:
         if runs
     ]
     if agreement.agrees:
-        return f"{agreement.where} agrees: it holds all runs, with the same values"
+        nearly = f", {agreement.reason}" if agreement.reason else ""
+        return f"{agreement.where} agrees: it holds all runs, with the same values{nearly}"
     if agreement.values == "different":
         parts.append(f"the values differ: {agreement.reason}")
     if agreement.agrees is False:

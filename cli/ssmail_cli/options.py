@@ -208,7 +208,7 @@ StatOfFigures = Annotated[
         "--stat",
         callback=known_statistic,
         help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
-        show_default="mean-std",
+        show_default="median-iqr on logarithmic axes, else mean-std",
     ),
 ]
 

@@ -117,7 +117,11 @@ class FigureCommand(TyperCommand):
     def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
         module = FIGURES[name]
         lacks = {"environment": not module.has_environment, "stat": not module.has_statistic}
-        super().__init__(name, params=[item for item in params if not lacks.get(item.name)], **settings)
+        kept = [item for item in params if not lacks.get(item.name)]
+        for item in kept:
+            if item.name == "stat":
+                item.show_default = module.statistic
+        super().__init__(name, params=kept, **settings)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the options. Raises InputError for two choices of runs."""

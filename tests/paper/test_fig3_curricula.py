@@ -60,7 +60,7 @@ def test_picture_and_csv_show_the_record(filled: Store, tmp_path: Path) -> None:
         assert closed.get_color() == style.REFERENCE
         assert closed.is_dashed()
     assert drawn == {}
-    assert axes.get_ylabel() == "mean segment length (steps)"
+    assert axes.get_ylabel() == "mean segment length\n(steps, logarithmic scale)"
     assert axes.get_xlabel() == "epoch"
     words = [text.get_text() for text in figure.legends[0].get_texts()]
     assert words[-1] == "expected, T / (1 + (T - 1) f)"

@@ -8,13 +8,16 @@ import pandas as pd
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic, mean_interval, median_quartiles
 from ssmail.paper import fig4_stability
+from ssmail.paper.fig4_stability import StabilityRecord
 from ssmail.paper.results import FIGURES
+from ssmail.plots import style
 from ssmail.store import RunState, Store
 from tests.paper.figure_files import save
 
@@ -28,8 +31,10 @@ def legend(figure: Figure) -> list[str]:
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def titles(figure: Figure) -> list[str]:
-    return [axes.get_title(loc="left") for axes in figure.axes]
+def means(store: Store) -> StabilityRecord:
+    record = FIGURES["fig4"].collect(store, statistic=Statistic.MEAN_STD)
+    assert isinstance(record, StabilityRecord)
+    return record
 
 
 def drawn(store: Store) -> Figure:
@@ -38,7 +43,7 @@ def drawn(store: Store) -> Figure:
 
 def test_mean_and_std_are_over_all_seeds(store: Store, add_run: Any) -> None:
     runs = [add_run(0, [0.04, 0.02, 0.01]), add_run(1, [0.06, 0.02, 0.04])]
-    record = FIGURES["fig4"].collect(store)
+    record = means(store)
     (band,) = record.bands
     assert [curve.run_id for curve in band.curves] == runs
     np.testing.assert_array_equal(band.curves[1].values, [0.06, 0.02, 0.04])
@@ -67,13 +72,15 @@ def test_a_single_run_has_no_band(store: Store, add_run: Any) -> None:
         record = FIGURES["fig4"].collect(store, statistic=statistic)
         np.testing.assert_array_equal(record.bands[0].summary.centre, [0.04, 0.02])
         figure = fig4_stability.draw(record)
-        assert titles(figure) == ["ssail: 1 run"]
+        assert legend(figure)[0] == "ssail: 1 run"
         assert band_of(figure.axes[0]) == {}
 
 
-def band_of(axes: Axes) -> dict[float, tuple[float, float]]:
+def band_of(axes: Axes, method: str = "ssail") -> dict[float, tuple[float, float]]:
     """The lower and upper end of the drawn band, by epoch."""
-    (area,) = (item for item in axes.collections if isinstance(item, PolyCollection))
+    colour = to_rgb(style.METHODS[method].colour)
+    areas = [item for item in axes.collections if isinstance(item, PolyCollection)]
+    (area,) = (item for item in areas if tuple(item.get_facecolor()[0][:3]) == colour)
     points = [tuple(point) for path in area.get_paths() for point in path.vertices]
     return {x: (min(y for at, y in points if at == x), max(y for at, y in points if at == x)) for x, _ in points}
 
@@ -86,13 +93,13 @@ def test_a_diverged_seed_stays_in_the_statistic_and_is_marked(
 ) -> None:
     healthy = add_run(0, [0.04, 0.02, 0.01])
     lost = add_run(1, errors, RunState.DIVERGED)
-    record = FIGURES["fig4"].collect(store)
+    record = means(store)
     (band,) = record.bands
     assert [curve.diverged_at for curve in band.curves] == [None, epoch]
     known = [e <= len(errors) and np.isfinite(errors[e - 1]) for e in (1, 2, 3)]
     np.testing.assert_array_equal(np.isfinite(band.summary.centre), known)  # never the mean of the survivors alone
     figure = fig4_stability.draw(record)
-    assert titles(figure) == ["ssail: 2 runs, 1 diverged (x)"]
+    assert legend(figure)[0] == "ssail: 2 runs, 1 diverged (x)"
     (axes,) = figure.axes
     cross = lines(axes)[f"diverged-{lost}"]
     assert (cross.get_xdata()[0], cross.get_ydata()[0]) == (epoch, axes.get_ylim()[1])
@@ -118,7 +125,7 @@ def test_only_diverged_seeds_can_be_drawn(store: Store, add_run: Any) -> None:
     assert record.constant_velocity is None
     for statistic in Statistic:
         figure = fig4_stability.draw(FIGURES["fig4"].collect(store, statistic=statistic))
-        assert titles(figure) == ["ssail: 1 run, 1 diverged (x)"]
+        assert legend(figure)[0] == "ssail: 1 run, 1 diverged (x)"
 
 
 def test_the_csv_is_what_is_drawn(store: Store, add_run: Any, tmp_path: Path) -> None:
@@ -126,25 +133,28 @@ def test_the_csv_is_what_is_drawn(store: Store, add_run: Any, tmp_path: Path) ->
         add_run(seed, errors)
         add_run(seed, [5 * error for error in errors], method="gail")
     add_run(2, [0.05, 0.7], RunState.DIVERGED)
-    record = FIGURES["fig4"].collect(store)
+    record = means(store)
     figure = fig4_stability.draw(record)
     csv = pd.read_csv(save("fig4", record, figure, tmp_path)[-1])
     assert set(csv["kind"]) == {"run", "mean", "diverged", "constant velocity"}
-    assert len(figure.axes) == 2
-    for axes, label in zip(figure.axes, ("ssail", "gail"), strict=True):
+    compared, *panels = figure.axes
+    assert [axes.get_title() for axes in panels] == ["ssail, every run", "gail, every run"]
+    together = lines(compared)
+    for axes, label in zip(panels, ("ssail", "gail"), strict=True):
         rows, named = csv[csv["label"] == label], lines(axes)
         for run_id, points in rows[rows["kind"] == "run"].groupby("run_id"):
             assert same(named.pop(f"run-{run_id}"), points)
         for run_id, points in rows[rows["kind"] == "diverged"].groupby("run_id"):
             np.testing.assert_array_equal(named.pop(f"diverged-{run_id}").get_xdata(), points["epoch"])
-        means = rows[rows["kind"] == "mean"]
-        assert same(named.pop(f"centre-{label}"), means)
-        (reference,) = csv.loc[csv["kind"] == "constant velocity", "value"]
-        assert list(named.pop("constant-velocity").get_ydata()) == [reference, reference]
         assert named == {}
-        shown, band = means.dropna(subset=["value"]), band_of(axes)
+        centre = rows[rows["kind"] == "mean"]
+        assert same(together.pop(f"centre-{label}"), centre)
+        shown, band = centre.dropna(subset=["value"]), band_of(compared, label)
         assert list(band) == list(shown["epoch"]) == [1, 2, 3][: len(shown)]
         np.testing.assert_allclose([band[x][1] for x in shown["epoch"]], shown["high"])
+    (reference,) = csv.loc[csv["kind"] == "constant velocity", "value"]
+    assert list(together.pop("constant-velocity").get_ydata()) == [reference, reference]
+    assert together == {}
     assert len(shown) == 3
     assert len(csv.query("kind == 'mean' and label == 'ssail'").dropna(subset=["value"])) == 2
 
@@ -158,14 +168,14 @@ def same(line: Line2D, rows: pd.DataFrame) -> bool:
 def test_a_band_that_a_logarithm_cannot_show_is_cut_and_that_is_said(store: Store, add_run: Any) -> None:
     add_run(0, [0.1, 0.1])
     add_run(1, [0.2, 50.0])  # at epoch 2 the mean less the standard deviation is negative
-    record = FIGURES["fig4"].collect(store)
+    record = means(store)
     low = record.bands[0].summary.low
     assert low[1] < 0 < low[0]
     band = band_of(fig4_stability.draw(record).axes[0])
     np.testing.assert_allclose([band[1][0], band[2][0]], [low[0], 0.1 / 3])
     assert record.notes[-1].startswith("the band of ssail is cut a factor 3 below the lowest run")
     add_run(1, [0.2, 0.12])
-    assert "is cut" not in " ".join(FIGURES["fig4"].collect(store).notes)
+    assert "is cut" not in " ".join(means(store).notes)
 
 
 def test_the_scale_ends_where_every_rollout_has_diverged(store: Store, add_run: Any) -> None:
@@ -200,20 +210,34 @@ def test_many_runs_and_runs_that_all_diverged_do_no_harm(store: Store, add_run: 
         add_run(seed, [], RunState.DIVERGED, method="gail")
     (found,) = (note for note in FIGURES["fig4"].collect(store).notes if "permutation" in note)
     assert found.startswith("ssail against gail at the last epoch: medians 0.1 and inf")
-    assert len(drawn(store).axes) == 3
+    assert len(drawn(store).axes) == 1 + 3
 
 
-def test_every_method_has_a_panel_of_one_scale(store: Store, add_run: Any) -> None:
+def test_one_panel_compares_the_methods_and_small_ones_have_the_runs(store: Store, add_run: Any) -> None:
     for method, level in (("ssail", 0.002), ("gail", 0.5), ("wail", 0.05)):
         for seed in range(2):
             add_run(seed, [1.0, level], method=method)
     figure = drawn(store)
-    assert titles(figure) == ["ssail: 2 runs", "gail: 2 runs", "wail: 2 runs"]
-    assert legend(figure) == ["ssail", "gail", "wail", "constant velocity (test)"]
-    assert len({axes.get_ylim() for axes in figure.axes}) == 1
-    for axes in figure.axes:  # two seeds, every method's mean, and the reference
-        assert len(axes.lines) == 2 + 3 + 1
-        assert len({(line.get_color(), line.get_linestyle()) for line in axes.lines if line.get_linewidth() > 0.6}) == 4
+    assert legend(figure) == ["ssail: 2 runs", "gail: 2 runs", "wail: 2 runs", "constant velocity (test)"]
+    compared, *panels = figure.axes
+    assert len({(axes.get_xlim(), axes.get_ylim()) for axes in figure.axes}) == 1
+    assert len({(line.get_color(), line.get_linestyle()) for line in compared.lines}) == len(compared.lines) == 3 + 1
+    assert [len(axes.lines) for axes in panels] == [2, 2, 2]
+
+
+def test_no_label_is_cut(store: Store, add_run: Any) -> None:
+    for method in ("ssail", "gail"):
+        add_run(0, [1.0, 0.01], method=method)
+        figure = drawn(store)  # of one method, and of two
+        figure.canvas.draw()
+        page = figure.bbox
+        for axes in figure.axes:
+            for text in (axes.xaxis.label, axes.yaxis.label, axes.title):
+                box = text.get_window_extent()
+                assert page.x0 <= box.x0
+                assert box.x1 <= page.x1 + 1
+                assert page.y0 <= box.y0
+                assert box.y1 <= page.y1
 
 
 def test_the_axes_are_named_logarithmic_and_free_of_the_legend(store: Store, add_run: Any) -> None:
@@ -222,7 +246,7 @@ def test_the_axes_are_named_logarithmic_and_free_of_the_legend(store: Store, add
     (axes,) = figure.axes
     assert axes.get_yscale() == "log"
     assert axes.get_xlabel() == "epoch"
-    assert "squared scaled units" in figure.get_supylabel()
+    assert axes.get_ylabel() == "squared error to the\nnearest lane (scaled units²)"
     figure.canvas.draw()
     assert not figure.legends[0].get_window_extent().overlaps(axes.get_window_extent())
     assert figure.get_size_inches()[0] == pytest.approx(3.4)
@@ -233,9 +257,8 @@ def test_ids_draw_unfinished_runs_and_keep_specs_apart(store: Store, add_run: An
     record = FIGURES["fig4"].collect(store, ids)
     assert [len(band.curves) for band in record.bands] == [1, 1]
     figure = fig4_stability.draw(record)
-    colours = [
-        lines(axes)[f"centre-{band.label}"].get_color() for axes, band in zip(figure.axes, record.bands, strict=True)
-    ]
+    named = lines(figure.axes[0])
+    colours = [named[f"centre-{band.label}"].get_color() for band in record.bands]
     assert colours[0] != colours[1]
     silent = add_run(1, [], RunState.RUNNING)
     with pytest.raises(InputError, match=rf"^run {silent[:8]} \(running\) has no train/mode_mse yet; "):

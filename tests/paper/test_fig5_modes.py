@@ -1,4 +1,4 @@
-"""Figure 5: which rollouts a panel shows, what it says of them, and that picture and CSV agree."""
+"""Figure 5: which rollouts a panel shows, that it counts these, and that picture and CSV agree."""
 
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ssmail.errors import InputError
+from ssmail.evaluation.metrics import ON_PATH_TOLERANCE, polyline_distances
 from ssmail.paper import fig5_modes
 from ssmail.paper.results import FIGURES
 from ssmail.plots import style
@@ -32,7 +33,11 @@ def paths(axes: Axes, colour: str) -> list[np.ndarray]:
     return [line.get_xydata() for line in axes.lines if line.get_color() == colour and line.get_marker() == "None"]
 
 
-def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, add_run: Any) -> None:
+def titles(figure: Figure) -> list[str]:
+    return [axes.get_title() for axes in panels(figure)]
+
+
+def test_a_panel_holds_the_samples_in_turn_and_counts_them(store: Store, add_run: Any) -> None:
     runs = [add_run(0), add_run(1, shift=0.1)]
     record = FIGURES["fig5"].collect(store)
     assert [(panel.label, panel.run_id, panel.seed) for panel in record.panels] == [
@@ -43,9 +48,10 @@ def test_a_panel_holds_the_samples_in_turn_and_the_stored_shares(store: Store, a
         stored = arrays(shift)["test/rollouts"]
         expected = [stored[0, 0], stored[1, 1], stored[0, 2]]  # start b with sample b % 2
         np.testing.assert_array_equal(panel.rollouts, expected)
-        assert (panel.on_path, panel.path_rms, panel.lane_balance) == (0.75, 0.5, 0.25)
+        assert panel.on_path == 1.0
+        assert panel.lanes.tolist() == [0, 0, 0]  # lane (s + b) % 2
         assert record.outside(panel) == 0
-    np.testing.assert_array_equal(record.expert, lanes())
+    np.testing.assert_array_equal(record.centre_lines, arrays()["lane_centres"])
     assert record.provenance.run_ids == tuple(runs)
 
 
@@ -60,23 +66,39 @@ def test_the_shown_starts_are_spread_over_all(store: Store, add_run: Any) -> Non
 
 
 def test_picture_and_csv_show_the_record(store: Store, add_run: Any, tmp_path: Path) -> None:
-    runs = [add_run(0), add_run(1, shift=0.1)]
+    strays = arrays()["test/rollouts"]
+    strays[0, 0, 3, 1, 1] += 1.5  # the other agent and the other rollouts stay on the path
+    runs = [add_run(0), add_run(1, test__rollouts=strays)]
     record = FIGURES["fig5"].collect(store)
     figure = fig5_modes.draw(record)
     csv = pd.read_csv(save("modes", record, figure, tmp_path)[-1])
-    colour = style.METHODS["ssail"].colour
     for axes, run in zip(panels(figure), runs, strict=True):
         rows = csv[(csv["run_id"] == run) & (csv["kind"] == "rollout")]
-        assert same(paths(axes, colour), rows, ["trajectory", "agent"])
-        assert same(paths(axes, style.LANE), csv[csv["kind"] == "expert"], ["lane", "trajectory", "agent"])
-        (dots,) = (line for line in axes.lines if line.get_marker() == ".")
-        last = rows[rows["step"] == rows["step"].max()]
-        np.testing.assert_array_equal(dots.get_xydata(), last[["x", "y"]].to_numpy(np.float32))
-        assert (set(rows["on_path"]), set(rows["path_rms"])) == ({0.75}, {0.5})
+        for stays, colour in ((1, fig5_modes.STAYS), (0, fig5_modes.LEAVES)):
+            tracks = rows[rows["on_path"] == stays]
+            assert same(paths(axes, colour), tracks, ["trajectory", "agent"])
+            dots = [line for line in axes.lines if line.get_marker() == "." and line.get_color() == colour]
+            last = tracks[tracks["step"] == tracks["step"].max()]
+            assert len(dots) == (len(last) > 0)
+            for line in dots:
+                np.testing.assert_array_equal(line.get_xydata(), last[["x", "y"]].to_numpy(np.float32))
         assert axes.get_aspect() == 1.0
-    assert words(panels(figure)[1]) == ["seed 1", "75 % on path", "rms 0.5", "rarer lane 25 %"]
+    strayed = csv[(csv["run_id"] == runs[1]) & (csv["on_path"] == 0)]
+    assert set(zip(strayed["trajectory"], strayed["agent"], strict=True)) == {(0, 1)}
+    assert words(panels(figure)[1]) == ["83 % on path", "lanes 3 : 0"]
     assert figure.get_supxlabel() == "x (step lengths)"
     assert figure.get_supylabel() == "y (step lengths)"
+
+
+def test_the_strip_is_as_wide_as_what_counts_as_on_the_path(store: Store, add_run: Any) -> None:
+    add_run(0)
+    (axes,) = panels(fig5_modes.draw(FIGURES["fig5"].collect(store)))
+    strips = [patch.get_xy() for patch in axes.patches if patch.get_fill() and len(patch.get_xy()) > 5]
+    assert len(strips) == 2
+    for outline, line in zip(strips, arrays()["lane_centres"], strict=True):
+        away = polyline_distances(outline[1:5], line, extended=True)  # of points far from the bend
+        np.testing.assert_allclose(away[:2], ON_PATH_TOLERANCE, atol=1e-6)
+        assert outline[:, 0].max() > line[:, 0].max()  # it goes on to the edge
 
 
 def same(drawn: list[np.ndarray], rows: pd.DataFrame, keys: list[str]) -> bool:
@@ -117,10 +139,10 @@ def test_a_diverged_seed_has_a_panel_that_says_so(store: Store, add_run: Any) ->
     record = FIGURES["fig5"].collect(store)
     assert [panel.rollouts is None for panel in record.panels] == [False, True]
     first, second = panels(fig5_modes.draw(record))
-    assert words(second) == ["seed 1", "diverged:", "no test rollouts"]
+    assert words(second) == ["diverged:", "no test rollouts"]
     assert "diverged:" not in words(first)
-    assert len(paths(second, style.LANE)) == 2 * STARTS * AGENTS
-    assert paths(second, style.METHODS["ssail"].colour) == []
+    assert paths(second, fig5_modes.STAYS) == paths(second, fig5_modes.LEAVES) == []
+    assert len(paths(first, fig5_modes.STAYS)) == STARTS * AGENTS
     assert list(record.table().query("kind == 'diverged'")["run_id"]) == [lost]
 
 
@@ -128,27 +150,26 @@ def test_only_diverged_seeds_can_be_drawn(store: Store, add_run: Any) -> None:
     for seed in range(3):
         add_run(seed, [0.5], RunState.DIVERGED)
     record = FIGURES["fig5"].collect(store)
-    assert [words(axes)[0] for axes in panels(fig5_modes.draw(record))] == ["seed 0", "seed 1", "seed 2"]
+    assert titles(fig5_modes.draw(record)) == ["ssail, seed 0", "ssail, seed 1", "ssail, seed 2"]
     assert list(record.table()["kind"]) == ["diverged"] * 3
 
 
-def test_two_groups_stand_in_two_columns(store: Store, add_run: Any) -> None:
+def test_each_label_begins_a_row(store: Store, add_run: Any) -> None:
     ids = [add_run(0), add_run(1), add_run(0, overrides=["sac.gamma=0.5"])]
     figure = fig5_modes.draw(FIGURES["fig5"].collect(store, ids))
     labels = [f"ssail {spec}" for spec in dict.fromkeys(run.spec_hash[:8] for run in store.runs())]
-    places = {(words(axes)[0], axes.get_subplotspec().colspan.start) for axes in panels(figure)}
-    assert places == {("seed 0", 0), ("seed 1", 0), ("seed 0", 1)}
-    assert [axes.get_title() for axes in panels(figure)] == [labels[0], labels[1], ""]
+    assert titles(figure) == [f"{labels[0]}, seed 0", f"{labels[0]}, seed 1", f"{labels[1]}, seed 0"]
+    places = [axes.get_subplotspec() for axes in panels(figure)]
+    assert [(place.rowspan.start, place.colspan.start) for place in places] == [(0, 0), (0, 1), (1, 0)]
 
 
-def test_methods_stand_side_by_side_in_the_order_of_experiments_yaml(store: Store, add_run: Any) -> None:
-    for seed in range(2):
+def test_two_methods_of_five_seeds_are_two_rows_of_five_on_a_page(store: Store, add_run: Any) -> None:
+    for seed in range(5):
         for method in ("dnri", "ssail"):
-            add_run(seed, method=method, shift=seed)
+            add_run(seed, method=method)
     figure = fig5_modes.draw(FIGURES["fig5"].collect(store))
-    assert [axes.get_title() for axes in panels(figure)] == ["ssail", "dnri", "", ""]
-    for axes, method in zip(panels(figure), ("ssail", "dnri") * 2, strict=True):
-        assert len(paths(axes, style.METHODS[method].colour)) == STARTS * AGENTS
+    assert titles(figure) == [f"{method}, seed {seed}" for method in ("ssail", "dnri") for seed in range(5)]
+    assert figure.get_size_inches()[0] == style.PAGE_WIDTH
     figure.canvas.draw()
     (legend,) = figure.legends
     assert not any(legend.get_window_extent().overlaps(axes.get_window_extent()) for axes in panels(figure))
@@ -160,21 +181,22 @@ def test_an_unfinished_run_is_refused(store: Store, add_run: Any) -> None:
         FIGURES["fig5"].collect(store, [run])
 
 
-def test_an_earlier_run_has_the_numbers_of_its_stored_rollouts(store: Store, add_run: Any) -> None:
-    """Rollout k = 3 s + b is 0.01 k aside of the street, and on a lane of 45 degrees 0.01 k / sqrt(2)."""
+def test_notes_have_the_metrics_of_all_rollouts(store: Store, add_run: Any) -> None:
+    """Stored, or computed for runs of earlier versions: rollout k = 3 s + b is 0.01 k aside of the street."""
     add_run(0, measured=False)
     add_run(1, measured=False, shift=1.5)
     add_run(2)
     record = FIGURES["fig5"].collect(store)
-    near, far, new = record.panels
-    assert (near.on_path, far.on_path, new.on_path) == (1, 0, 0.75)
-    assert 0.01 < near.path_rms < 0.05
-    assert 1.06 < far.path_rms < 1.55
-    assert record.notes[-1].startswith("test/on_path, test/path_rms of 2 runs, stored before")
-    assert "the 6 test rollouts stored of each" in record.notes[-1]
+    assert [panel.on_path for panel in record.panels] == [1, 0, 1]
+    assert record.notes[-3:-1] == (
+        "ssail: over all test rollouts test/on_path is 100 % (seed 0), 0 % (seed 1), 75 % (seed 2).",
+        "ssail: over all test rollouts test/lane_balance is 25 % (seed 0), 25 % (seed 1), 25 % (seed 2).",
+    )
+    assert record.notes[-1].startswith("test/on_path of 2 runs, stored before")
+    assert record.notes[-1].endswith("the 6 test rollouts stored of each.")
 
 
-def test_a_panel_has_a_dash_for_what_nobody_knows(store: Store, add_run: Any) -> None:
-    add_run(0, measured=False, lane_centres=np.zeros(0))
+def test_a_panel_has_a_dash_where_the_lanes_are_unknown(store: Store, add_run: Any) -> None:
+    add_run(0, lane_centres=np.zeros(0))
     (axes,) = panels(fig5_modes.draw(FIGURES["fig5"].collect(store)))
-    assert words(axes) == ["seed 0", "- on path", "rms -", "rarer lane 25 %"]
+    assert words(axes) == ["- on path", "lanes 3"]

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.collections import LineCollection
 from matplotlib.lines import Line2D
 
 from ssmail.config.experiments import ablation_specs
@@ -30,7 +31,7 @@ def lines(figure: Any, panel: int = 0) -> dict[str, Line2D]:
 
 
 def test_mean_and_std_are_over_all_seeds_and_lost_with_one(store: Store, runs: dict[float, list[str]]) -> None:
-    record = FIGURES["fig6"].collect(store)
+    record = FIGURES["fig6"].collect(store, statistic=Statistic.MEAN_STD)
     first, second, third = record.columns
     assert [column.value for column in record.columns] == [0.0, 0.05, 1.0]
     assert [column.run_ids for column in record.columns] == [tuple(found) for found in runs.values()]
@@ -72,6 +73,7 @@ def test_picture_and_csv_show_the_record(
     csv = pd.read_csv(save("beta", record, figure, tmp_path)[-1])
     upper, lower = figure.axes
     centres = csv[csv["kind"] == statistic.centre]
+    means = csv[csv["kind"] == "mean"]
     for axes, name in ((upper, "mode_mse"), (lower, "lane_balance")):
         line = lines(figure, figure.axes.index(axes))["centres"]
         np.testing.assert_array_equal(line.get_ydata(), centres[name])
@@ -84,6 +86,11 @@ def test_picture_and_csv_show_the_record(
         crosses = lines(figure).get(f"diverged-{value:g}")
         assert (len(crosses.get_xdata()) if crosses else 0) == len(rows) - len(finite)
     assert list(lines(figure)["diverged-0"].get_ydata()) == [upper.get_ylim()[1]]
+    np.testing.assert_allclose(means["mode_mse"], [np.nan, 0.02, 0.2])
+    if statistic is Statistic.MEDIAN_IQR:
+        np.testing.assert_array_equal(lines(figure)["means"].get_ydata(), means["mode_mse"])
+    else:
+        assert "means" not in lines(figure)
     (reference,) = csv.loc[csv["kind"] == "constant velocity", "mode_mse"]
     assert lines(figure)["constant-velocity"].get_ydata()[0] == reference == 0.045
 
@@ -93,17 +100,35 @@ def test_the_axes_are_named_and_free_of_the_legend(store: Store, runs: dict[floa
     upper, lower = figure.axes
     assert [label.get_text() for label in lower.get_xticklabels()] == ["0", ".05", "1"]
     assert "evenly spaced" in lower.get_xlabel()
-    assert "squared scaled units" in upper.get_ylabel()
+    assert upper.get_ylabel() == "test squared error to the\nnearest lane (scaled units²)"
     assert upper.get_yscale() == "log"
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
         "one run",
-        "mean ± std",
+        "median and quartiles",
+        "mean",
         "diverged, 1 of 9 runs",
         "constant velocity (test)",
     ]
     figure.canvas.draw()
     assert not figure.legends[0].get_window_extent().overlaps(upper.get_window_extent())
     assert upper.get_window_extent().height > lower.get_window_extent().height > 30
+
+
+@pytest.mark.parametrize("statistic", Statistic)
+def test_nothing_leaves_the_axis_and_centres_stand_beside_their_runs(
+    store: Store, ablate: Any, statistic: Statistic
+) -> None:
+    ablate("beta", {0.0: [0.4, 0.002, 0.003], 1.0: [0.1, 0.1, 0.4]})  # here mean - std is negative
+    figure = fig6_beta.draw(FIGURES["fig6"].collect(store, statistic=statistic))
+    upper = figure.axes[0]
+    low, high = upper.get_ylim()
+    (bars,) = (item for item in upper.collections if isinstance(item, LineCollection))
+    ends = np.concatenate([segment[:, 1] for segment in bars.get_segments()])
+    assert low < ends.min()
+    assert ends.max() < high
+    named = lines(figure)
+    for index, label in enumerate(("0", "1")):
+        assert named[f"runs-{label}"].get_xdata().max() < index < named["centres"].get_xdata()[index]
 
 
 def test_a_single_run_and_only_diverged_ones_can_be_drawn(store: Store, ablate: Any) -> None:

@@ -173,7 +173,7 @@ def test_the_axes_are_named_linear_from_zero_and_free_of_the_legend(store: Store
         "noisy input (std 0.05 scaled units)",
     ]
     assert figure.axes[-1].get_xlabel() == "predicted step"
-    assert "squared scaled units" in figure.get_supylabel()
+    assert "scaled units²" in figure.get_supylabel()
     figure.canvas.draw()
     for axes, highest in zip(figure.axes, (0.04, 0.12), strict=True):
         assert axes.get_yscale() == "linear"

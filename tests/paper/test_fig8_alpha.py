@@ -43,7 +43,7 @@ def test_the_ranges_of_experiments_yaml_in_their_order(store: Store, vary_alpha:
 
 
 def test_mean_and_std_of_the_error_over_seeds(store: Store, runs: dict[Any, list[str]]) -> None:
-    record = FIGURES["fig8"].collect(store)
+    record = FIGURES["fig8"].collect(store, statistic=Statistic.MEAN_STD)
     positive, both = record.errors
     assert record.error == "train/mse"
     np.testing.assert_allclose(positive.summary.centre, [0.04, 0.02, 0.02])
@@ -78,7 +78,7 @@ def test_the_first_range_is_compared_with_the_others(store: Store, runs: dict[An
 
 def test_a_diverged_run_is_counted_and_shown(store: Store, vary_alpha: Any) -> None:
     (_, lost), _ = vary_alpha({POSITIVE: [0.01, None], BOTH: [0.001, 0.002]}).values()
-    record = FIGURES["fig8"].collect(store)
+    record = FIGURES["fig8"].collect(store, statistic=Statistic.MEAN_STD)
     assert [band.diverged for band in record.errors] == [1, 0]
     np.testing.assert_array_equal(np.isnan(record.errors[0].summary.centre), [False, True, True])
     figure = fig8_alpha.draw(record)
@@ -134,8 +134,8 @@ def test_the_axes_are_named_and_free_of_the_legend(store: Store, runs: dict[Any,
     figure = fig8_alpha.draw(FIGURES["fig8"].collect(store))
     upper, lower = figure.axes
     assert (upper.get_yscale(), lower.get_yscale()) == ("log", "linear")
-    assert upper.get_ylabel() == "training error, mse\n(squared scaled units)"
-    assert lower.get_ylabel().startswith("loss of D")
+    assert upper.get_ylabel() == "training squared error\n(squared scaled units)"
+    assert lower.get_ylabel().startswith("discriminator loss")
     assert lower.get_xlabel() == "epoch"
     assert lower.get_ylim()[0] == 0
     assert lower.get_ylim()[1] > fig8_alpha.UNDECIDED
@@ -154,7 +154,7 @@ def test_another_environment_has_its_own_runs_and_error(
     assert [band.curves[0].run_id for band in record.errors] == [run for (run,) in elsewhere.values()]
     assert record.errors[0].curves[0].values[-1] == 0.1
     assert record.constant_velocity == 0.045
-    assert fig8_alpha.draw(record).axes[0].get_ylabel().startswith("training error, mode_mse")
+    assert fig8_alpha.draw(record).axes[0].get_ylabel().startswith("training squared error to the nearest lane")
     assert len(FIGURES["fig8"].collect(store).errors[0].curves) == 3  # those of mocap are still its own
 
 

@@ -57,7 +57,7 @@ def test_the_spec_with_the_most_seeds_is_drawn_and_the_others_are_told(store: St
         ("ssail", [newer, tuned[0]]),
         ("dnri", [dnri]),
     ]
-    assert "seeds 0, 1; 1 other stored spec left out (choose with --runs)." in chosen.notes[0]
+    assert "seeds 0, 1; 1 other stored spec left out (`ssmail plot forecast --runs` chooses)." in chosen.notes[0]
 
 
 def test_named_runs_are_all_drawn_each_spec_by_itself(store: Store, add_trajectories: AddRun) -> None:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -50,11 +51,23 @@ def saved(store: Store, name: str, outdir: Path, formats: Sequence[str] = proven
 def test_each_format_gives_its_provenance_back(whole: Store, tmp_path: Path, name: str) -> None:
     record = FIGURES[name].collect(whole)
     expected = saving.embedded(record, saving.csv_text(record.table()))
+    assert expected.caption == record.caption
+    assert record.caption.endswith(".")
+    assert 100 < len(record.caption) < 700
     *images, csv = saved(whole, name, tmp_path, FORMATS[name])
     stem = FIGURES[name].stem
     assert [path.name for path in images] == [f"{stem}.{format}" for format in FORMATS[name]]
     assert csv.name == f"{stem}.csv"
     assert [provenance.read(path) for path in images] == [expected] * len(images)
+
+
+def test_the_caption_is_where_other_programs_look_for_it(filled: Store, tmp_path: Path) -> None:
+    png, pdf, svg, _ = saved(filled, "fig4", tmp_path)
+    caption = FIGURES["fig4"].collect(filled).caption
+    assert "(3 of ssail, of which 1 diverged)" in caption
+    assert Image.open(png).info["Description"] == caption
+    assert pypdf.PdfReader(pdf).metadata["/Subject"] == caption
+    assert f"ssmail fig4: {caption}" in unescape(svg.read_text())
 
 
 def test_provenance_names_runs_specs_data_and_code(filled: Store) -> None:

@@ -75,7 +75,7 @@ def test_what_is_left_out_is_said(store: Store, add_run: Any) -> None:
     add_run(0, overrides=OTHER)
     add_run(0, overrides=ANOTHER)
     note = series.select(store, "fig4").notes[0]
-    assert "2 other stored specs left out (choose with --runs)" in note
+    assert "2 other stored specs left out (`ssmail plot fig4 --runs` chooses)" in note
 
 
 def test_ids_replace_the_choice_and_keep_specs_apart(store: Store, add_run: Any) -> None:

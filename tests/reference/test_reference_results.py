@@ -1,9 +1,13 @@
 """results/reference: the figures, verdicts and tables that we show come from the database that we show."""
 
 import io
+import os
+import platform
 import re
 import shutil
 import sqlite3
+import subprocess
+import sys
 from pathlib import Path
 
 import pandas as pd
@@ -66,6 +70,17 @@ def test_another_value_shows_in_the_figure(copy: Path, tmp_path: Path) -> None:
     now = redrawn(Store.open(str(other)), "fig4")
     with pytest.raises(AssertionError):
         pd.testing.assert_frame_equal(now, shown, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="OpenBLAS has other kernels there")
+def test_a_figure_agrees_on_another_processor(copy: Path) -> None:
+    """Figure 7 has fitted slopes, whose last digits change with the kernel of OpenBLAS."""
+    figure = REFERENCE / "figures" / "fig7_noise.png"
+    command = [sys.executable, "-m", "ssmail_cli", "explain", str(figure), "--db", str(copy)]
+    other = {**os.environ, "OPENBLAS_CORETYPE": "Prescott"}
+    told = subprocess.run(command, env=other, capture_output=True, text=True, timeout=300, check=False)
+    assert told.returncode == 0, told.stdout + told.stderr
+    assert "agrees: it holds all runs, with the same values, to within 1e-06 of each number" in told.stdout
 
 
 def test_five_seeds_of_each_spec_and_every_run_has_ended(store: Store) -> None:

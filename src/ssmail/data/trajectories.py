@@ -13,6 +13,7 @@ from ssmail.data.scaling import Scaling, ends
 
 Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes
 Integers = NDArray[np.int64]
+Booleans = NDArray[np.bool_]
 SPLITS = ("train", "validation", "test")
 LARGEST_SCALED = 1e6  # of scaled positions and velocities; those to train on are in [-1, 1]
 FIELDS = {  # environment -> the arrays of a split that are hashed and stored, in this order; the rest follows from them

@@ -7,7 +7,7 @@ leading axis. The measures take predicted steps only, without the given start.
 import numpy as np
 
 from ssmail.data.scaling import Scaling
-from ssmail.data.trajectories import Floats, Integers, Trajectories
+from ssmail.data.trajectories import Booleans, Floats, Integers, Trajectories
 
 ON_LANE_TOLERANCE = 0.15  # of the final lane separation
 ON_PATH_TOLERANCE = 1.0  # step lengths; the expert stays within 0.6
@@ -152,16 +152,31 @@ def on_lane(predicted: Floats, continuations: Floats, centre_lines: Floats) -> f
 def path_metrics(predicted: Floats, centre_lines: Floats) -> dict[str, float]:
     """Return how far agents go sideways of the lanes on their whole path, from positions (B, T, N, 2) in step lengths.
 
-    Each agent is compared with the centre line that its path is nearest to, in the mean square. on_path: share of
-    agents that stay within ON_PATH_TOLERANCE of it at every step. path_rms: root mean square distance from it, inf if a
+    on_path: share of agents that are `stays_on_path`. path_rms: root mean square of the `path_distances`, inf if a
     position is not finite. Neither sees tempo: an agent that stands still on the street is on its path.
+    """
+    own = path_distances(predicted, centre_lines)
+    return {"on_path": float(stays_on_path(own).mean()), "path_rms": float(np.sqrt(np.square(own).mean()))}
+
+
+def stays_on_path(distances: Floats) -> Booleans:
+    """Return (B, N) whether an agent stays within ON_PATH_TOLERANCE at every step, from its `path_distances`."""
+    stays: Booleans = distances.max(axis=1) <= ON_PATH_TOLERANCE
+    return stays
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def path_distances(predicted: Floats, centre_lines: Floats) -> Floats:
+    """Return the distances (B, T, N) of positions (B, T, N, 2) from each agent's own centre line of (L, P', 2).
+
+    It is the one that the agent's path is nearest to, in the mean square, and goes on beyond its last point. A position
+    that is not finite is infinitely far away.
     """
     distances = np.stack([polyline_distances(predicted, corners(line), extended=True) for line in centre_lines])
     distances = np.nan_to_num(distances, nan=np.inf)  # (L, B, T, N)
     lane = np.square(distances).mean(axis=2, keepdims=True).argmin(axis=0, keepdims=True)
-    own = np.take_along_axis(distances, lane, axis=0)[0]
-    within = own.max(axis=1) <= ON_PATH_TOLERANCE
-    return {"on_path": float(within.mean()), "path_rms": float(np.sqrt(np.square(own).mean()))}
+    own: Floats = np.take_along_axis(distances, lane, axis=0)[0]
+    return own
 
 
 @np.errstate(over="ignore", invalid="ignore")

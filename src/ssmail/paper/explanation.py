@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
-from itertools import zip_longest
 from pathlib import Path
 
 import pandas as pd
@@ -11,6 +10,7 @@ import pandas as pd
 from ssmail.config.foreign_files import open_regular, read_whole
 from ssmail.errors import InputError, stored_values
 from ssmail.evaluation.statistics import Statistic
+from ssmail.paper.csv_comparison import RELATIVE, first_difference
 from ssmail.paper.results import FIGURES
 from ssmail.plots import ablation, forecast_curves, forecast_trajectories, provenance, training_curves
 from ssmail.plots.data_sets import data_sets
@@ -39,8 +39,9 @@ class Explanation:
 class Agreement:
     """How a database compares with a figure.
 
-    runs: by run id, "same", "missing", or what has changed. values: "same", "different", or None where they cannot be
-    compared. reason: the first difference, or why they cannot be compared.
+    runs: by run id, "same", "missing", or what has changed. values: "same" (see csv_comparison), "different", or None
+    where they cannot be compared. reason: the first difference, why they cannot be compared, or how nearly they are the
+    same where they are not so to the last digit.
     """
 
     where: str
@@ -92,10 +93,14 @@ def compare(explanation: Explanation, store: Store) -> Agreement:
         table = _collect_again(source, store)
     except InputError as error:
         return Agreement(store.where, runs, None, str(error).rstrip("."))
-    text = csv_text(table)
-    if digest(text) == source.csv_sha256:
+    if digest(csv_text(table)) == source.csv_sha256:
         return Agreement(store.where, runs, "same", None)
-    return Agreement(store.where, runs, "different", _first_difference(explanation, text))
+    if explanation.csv_state != "as written":
+        return Agreement(store.where, runs, None, "its hash differs, and the CSV that was written with it is not there")
+    difference = first_difference(explanation.csv.name, explanation.csv.read_text("utf-8", "replace"), table)
+    if difference is None:
+        return Agreement(store.where, runs, "same", f"to within {RELATIVE:g} of each number")
+    return Agreement(store.where, runs, "different", difference)
 
 
 def _csv_state(csv: Path, source: Provenance) -> str | None:
@@ -171,14 +176,3 @@ def _collect_forecasts(source: Provenance, store: Store, statistic: Statistic) -
     if len(source.run_ids) != 1 or not isinstance(windows, list) or not all(type(index) is int for index in windows):
         raise InputError("it does not tell which windows of which run it shows")
     return forecast_trajectories.collect(store, source.run_ids[0], windows).table()
-
-
-def _first_difference(explanation: Explanation, text: str) -> str:
-    """The first line in which the CSV differs, if the one that was written with the figure is still there."""
-    if explanation.csv_state != "as written":
-        return "the CSV that was written with it is not there to say where"
-    written = explanation.csv.read_text("utf-8", "replace").splitlines()
-    for number, (was, now) in enumerate(zip_longest(written, text.splitlines(), fillvalue="nothing"), start=1):
-        if was != now:
-            return f"line {number} of {explanation.csv.name} was {was}, is {now}"
-    return "only the ends of lines differ"

@@ -1,12 +1,13 @@
 """Figure 1 (sections 1, A.2): the reward over the plane, ideal and as gail and ssail learn it, for the task of Fig. 1a.
 
 Panels: (a) the task, with rollouts of the untrained policy and trajectories of the expert; (b) the ideal reward
-(`ssmail.evaluation.landscape.ideal_reward`); (c) gail's and (d) ssail's reward after the last epoch of training. Of
-each method one seed is shown: the one with the median slope share (the lower of two).
+(`ssmail.evaluation.landscape.ideal_reward`); (c) gail's and (d) ssail's reward after the last epoch of training. Both
+methods show the same seed, the one whose slope shares are closest to the medians (`typical_seed`).
 
 Each point of the plane shows the reward of the agent whose expert comes nearest to it; docs/paper.md explains how the
-other coordinates are chosen. Colours run from the lowest (0) to the highest (1) reward of a panel, with contour lines
-at tenths.
+other coordinates are chosen. Rewards are in units of their spread: minus the mean over the plane, in standard
+deviations over the plane. So all panels have one scale of colours, and one of contour lines, half a standard deviation
+apart, although the methods have rewards of different units.
 
 The CSV and the notes have the numbers of every seed: the stored metrics `landscape/slope_share` and
 `landscape/cosine`, after the last epoch and after the epoch that figure 2 shows, and the slope share at other
@@ -36,7 +37,9 @@ from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, WORST, Runs
+from ssmail.paper.typical_seed import typical_runs
 from ssmail.plots import landscape_grids, style
+from ssmail.plots.formatting import listed
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
@@ -58,6 +61,7 @@ EVERYWHERE = 0.9  # of the plane
 TOWARDS = 0.5  # cosine: within 60 degrees
 SHARE_STATISTIC = f"{SHARE}: share of the plane where the learned reward has a usable slope, after training"
 COSINE_STATISTIC = f"{COSINE}: mean cosine between that slope and the direction to the expert, after training"
+LIMITS = (-2.5, 2.5)  # of the colours, in standard deviations
 THRESHOLDS = (0.1, USABLE, 0.5)  # of the slope share, as fractions of the even slope; the stored metric uses USABLE
 
 
@@ -86,7 +90,7 @@ class Shown:
     label: str
     run: RunRow
     landscape: Landscape
-    reward: Floats  # (H, W) from 0 to 1
+    reward: Floats  # (H, W) in standard deviations from its mean
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +98,7 @@ class LandscapesRecord:
     """The contents of figure 1. Positions are in the environment's own units."""
 
     untrained: Floats  # (R, T, N, 2)
-    ideal: Floats  # (H, W) from 0 to 1
+    ideal: Floats  # (H, W) in standard deviations from its mean
     shown: tuple[Shown, ...]  # gail first, as in the paper
     measured: tuple[Measured, ...]
     provenance: Provenance
@@ -104,6 +108,22 @@ class LandscapesRecord:
     def landscape(self) -> Landscape:
         """The landscape whose plane and expert are also those of the task and the ideal reward."""
         return self.shown[-1].landscape
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        environment = self.shown[-1].run.environment
+        letters = "cdefgh"
+        learned = [
+            f"({letter}) the one that {item.label} learned, after epoch {item.landscape.epoch} (seed {item.run.seed})"
+            for letter, item in zip(letters, self.shown, strict=False)
+        ]
+        return (
+            f"The reward over the plane on {environment}: (a) the task, with trajectories of the expert and rollouts "
+            f"of the untrained policy; {listed(['(b) an ideal reward', *learned])}. Each point shows the reward of the "
+            "agent whose expert comes nearest to it. Rewards have one scale: standard deviations from the mean over "
+            "the plane, with contour lines at every half."
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, slope_share, cosine, threshold, trajectory, agent, step, x, y, reward].
@@ -128,22 +148,18 @@ def collect(store: Store, selection: Selection) -> LandscapesRecord:
     """Collect the landscapes of the runs. Raises InputError for a run without landscapes."""
     measured = _measured(store, selection)
     order = sorted(dict.fromkeys(item.label for item in measured), key=lambda label: label.startswith("ssail"))
-    shown = [_shown(store, median_of([item for item in measured if item.label == label])) for label in order]
+    groups = [[item for item in measured if item.label == label] for label in order]
+    places = typical_runs([[(item.run.seed, np.nan_to_num(item.last[0], nan=-1.0)) for item in of] for of in groups])
+    shown = [_shown(store, of[place]) for of, place in zip(groups, places, strict=True)]
     first = shown[-1]
     return LandscapesRecord(
         untrained=landscape_grids.read(store, first.run, landscape_grids.stored_epochs(store, first.run)[0]).rollouts,
-        ideal=landscape_grids.normalised(_ideal(first.landscape)),
+        ideal=landscape_grids.standardised(_ideal(first.landscape)),
         shown=tuple(shown),
         measured=measured,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=(*selection.notes, *_notes(measured, shown)),
     )
-
-
-def median_of(measured: Sequence[Measured]) -> Measured:
-    """Return the run with the median last slope share, the lower of two; a run without one counts as the lowest."""
-    ranked = sorted(measured, key=lambda item: (np.nan_to_num(item.last[0], nan=-1.0), item.run.seed))
-    return ranked[(len(ranked) - 1) // 2]
 
 
 def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
@@ -164,7 +180,7 @@ def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
 
 def _shown(store: Store, measured: Measured) -> Shown:
     landscape = landscape_grids.read(store, measured.run, landscape_grids.stored_epochs(store, measured.run)[-1])
-    reward = landscape_grids.normalised(landscape.joined(landscape.reward))
+    reward = landscape_grids.standardised(landscape.joined(landscape.reward))
     return Shown(measured.label, measured.run, landscape, reward)
 
 
@@ -184,7 +200,7 @@ def _notes(measured: Sequence[Measured], shown: Sequence[Shown]) -> list[str]:
         numbers = ", ".join(f"{one.last[0]:.2f} and {one.last[1]:.2f} (seed {one.run.seed})" for one in of)
         notes.append(
             f"{item.label}: after epoch {item.landscape.epoch} the slope share and the cosine are {numbers}; seed "
-            f"{item.run.seed} is shown, the median by slope share."
+            f"{item.run.seed} is shown, close to the median by slope share."
         )
     return notes
 
@@ -226,19 +242,21 @@ def draw(record: LandscapesRecord) -> Figure:
         for axes in grid[panels:]:
             axes.set_axis_off()
         _draw_task(grid[0], record)
-        images = [landscape_grids.draw_reward(grid[1], record.landscape, record.ideal)]
+        images = [landscape_grids.draw_reward(grid[1], record.landscape, record.ideal, LIMITS)]
         _title(grid[1], 1, "ideal reward")
         for place, item in enumerate(record.shown, start=2):
-            images.append(landscape_grids.draw_reward(grid[place], item.landscape, item.reward))
+            images.append(landscape_grids.draw_reward(grid[place], item.landscape, item.reward, LIMITS))
             _title(
                 grid[place], place, f"{style.literal(item.label)}, seed {item.run.seed}, epoch {item.landscape.epoch}"
             )
         landscape_grids.label_axes(list(grid[:panels]), 2, record.shown[0].run.environment)
         for axes in grid[1:panels]:
             landscape_grids.draw_paths(axes, record.landscape.expert[:4], landscape_grids.EXPERT, lw=0.5)
-        bar = figure.colorbar(images[0], ax=list(grid), location="bottom", aspect=40, fraction=0.04, pad=0.02)
-        bar.set_label("reward (0: lowest, 1: highest of the panel)", fontsize=7)
-        bar.set_ticks([0, 0.5, 1])
+        bar = figure.colorbar(
+            images[0], ax=list(grid), location="bottom", aspect=40, fraction=0.04, pad=0.02, extend="both"
+        )
+        bar.set_label("reward minus mean (standard deviations over plane)", fontsize=7)
+        bar.set_ticks([-2, -1, 0, 1, 2])
         kinds = {"expert": landscape_grids.EXPERT, "untrained policy": landscape_grids.POLICY}
         handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
         figure.legend(handles=handles, loc="outside upper center", ncols=2)

@@ -1,16 +1,18 @@
 """Figure 2 (section 3.1.3; "Fig. 3" in its text): the gradient of the learned reward around the current trajectory,
 for the ranges that alpha is drawn from.
 
-Arrows start at positions of tau_alpha = (1 - alpha) tau_G + alpha tau_E at some steps, for alpha from -1 to below 1.
-tau_G are rollouts of the policy after half of the epochs, when it is still away from the expert; tau_E is the training
-trajectory nearest to each of them. An arrow has the direction of the gradient of an agent's reward with respect to its
-own position, at the state and the action of tau_alpha. Its colour shows whether it points towards the position of tau_E
-at the same step (by less than a right angle) or away. There is no arrow where the expert is reached or the gradient is
-zero.
+Arrows stand at positions of tau_alpha = (1 - alpha) tau_G + alpha tau_E, for alpha from -1 to below 1. tau_G is a
+rollout of the policy after half of the epochs, when it is still away from the expert; tau_E is the training trajectory
+nearest to it. An arrow has the direction of the gradient of an agent's reward with respect to its own position, at the
+state and the action of tau_alpha. Its colour is alpha, the label that D is trained to give there: below 0 it stands
+behind the current trajectory. Where the positions of many steps and alphas crowd, one arrow stands for each cell of a
+grid: that of the position nearest to the middle of the cell. There is no arrow where the expert is reached or the
+gradient is zero.
 
-Each range has a panel with one seed: the one with the median `landscape/behind_cosine` (the lower of two), which is the
-mean cosine between the gradient and the direction to the expert over all points with negative alpha, of all rollouts,
-steps and agents. The CSV and the notes have the numbers of every seed.
+Each range has a panel with one seed, the same one if the field of a common seed is stored: the one whose
+`landscape/behind_cosine` are closest to the medians (`typical_seed`). This number is the mean cosine between the
+gradient and the direction to the expert over all points with negative alpha, of all rollouts, steps and agents. The CSV
+and the notes have the numbers of every seed.
 
 Claim C8: behind the current trajectory the slope of D points to the expert only if D has seen negative alpha. Behind is
 where alpha is negative: on the far side of the current trajectory, seen from the expert.
@@ -18,12 +20,16 @@ where alpha is negative: on the far side of the current trajectory, seen from th
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import matplotlib
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.quiver import Quiver
 
 from ssmail.config.experiments import display_value
 from ssmail.data.trajectories import Floats
@@ -32,8 +38,9 @@ from ssmail.evaluation.landscape import Plane, cosines
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, WORST, Runs
+from ssmail.paper.typical_seed import typical_runs
 from ssmail.plots import landscape_grids, style
-from ssmail.plots.formatting import setting
+from ssmail.plots.formatting import listed, setting
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
 from ssmail.plots.series import figure_ablation
@@ -59,12 +66,15 @@ BEHIND_STATISTIC = (
     f"{BEHIND}: mean cosine between D's slope and the direction to the expert at negative alpha, "
     "after half of the epochs"
 )
-STEPS = 10  # of a trajectory, at which arrows stand
 TRAJECTORIES = 1  # shown
+CELLS = 30  # of the grid, along the longer side of the frame
 FRAME_WIDENING = 0.7  # at most, for a policy that leaves the expert, as a share of the expert's longer side
-MARGIN = 0.15  # around current trajectory and expert, as a share of the longer side
-TOWARDS, AWAY = "#009E73", "#CC79A7"  # colours
-ARROW = 0.03  # length, as a share of the frame's width
+MARGIN = 0.1  # around current trajectory and expert, as a share of the longer side
+ARROW = 0.95  # length, as a share of a cell
+MAP, DARKEST, BRIGHTEST = "plasma", 0.0, 0.88  # colours of alpha from -1 to 1; the brightest yellow is lost on white
+LINES: dict[str, Any] = {"expert": "-", "current": (0, (3, 1.5))}
+
+Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +84,7 @@ class Field:
     label: str
     run: RunRow
     epoch: int
+    behind: float  # the run's landscape/behind_cosine
     alpha: Floats  # (A,)
     current: Floats  # (R, T, N, 2)
     expert: Floats  # (R, T, N, 2)
@@ -106,26 +117,23 @@ class VectorFieldRecord:
 
     fields: tuple[Field, ...]  # one for each range
     measured: tuple[Measured, ...]
-    spacing: float  # of the plane's grid: points closer to the expert than this have no arrow
+    arrows: tuple[pd.DataFrame, ...]  # one for each field: see _arrows
+    frame: Frame
     provenance: Provenance
     notes: tuple[str, ...]
 
     @property
-    def frame(self) -> tuple[float, float, float, float]:
-        """Left, right, bottom and top of the trajectories, with a margin.
-
-        A policy that goes far away widens the frame by at most FRAME_WIDENING times the expert's longer side.
-        """
-        current, expert = (
-            np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in self.fields])
-            for kind in ("current", "expert")
+    def caption(self) -> str:
+        """See FigureRecord."""
+        ranges = listed([f"{field.label} (seed {field.run.seed})" for field in self.fields])
+        first = self.fields[0]
+        return (
+            "The direction of the gradient of an agent's learned reward with respect to its position, at points of "
+            f"tau_alpha = (1 - alpha) tau_G + alpha tau_E on {first.run.environment}, for alpha drawn from {ranges} in "
+            f"training. tau_G is a rollout of the policy after epoch {first.epoch} (dashed), tau_E the nearest "
+            "trajectory of the expert (solid). Colour is alpha, which is the label of the point: negative behind the "
+            "current trajectory, where the mean cosine compares the gradient with the direction to the expert."
         )
-        low, high = expert.min(axis=0), expert.max(axis=0)
-        reach = FRAME_WIDENING * (high - low).max()
-        seen = np.clip(current[np.isfinite(current).all(axis=1)], low - reach, high + reach)
-        (left, bottom), (right, top) = (f(np.concatenate([expert, seen]), axis=0) for f in (np.min, np.max))
-        margin = MARGIN * max(right - left, top - bottom)
-        return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, behind_cosine, ahead_cosine, epoch, alpha, trajectory, agent, step, x, y,
@@ -136,8 +144,16 @@ class VectorFieldRecord:
         numbers = [("number", one.label, one.run.id, one.run.seed, one.behind, one.ahead) for one in self.measured]
         named = ["kind", "label", "run_id", "seed", "behind_cosine", "ahead_cosine"]
         parts = [pd.DataFrame(numbers, columns=named)]
-        for field in self.fields:
-            parts += _field_rows(field)
+        for field, arrows in zip(self.fields, self.arrows, strict=True):
+            shown: dict[str, Any] = {
+                "label": field.label,
+                "run_id": field.run.id,
+                "seed": field.run.seed,
+                "epoch": field.epoch,
+            }
+            for kind in ("current", "expert"):
+                parts.append(landscape_grids.path_rows(getattr(field, kind)[:TRAJECTORIES], kind=kind, **shown))
+            parts.append(arrows.assign(kind="arrow", **shown))
         points = ["epoch", "alpha", "trajectory", "agent", "step", "x", "y", "gradient_x", "gradient_y", "cosine"]
         table = pd.concat(parts, ignore_index=True).reindex(columns=[*named, *points])
         return table.astype(dict.fromkeys(["seed", "epoch", "trajectory", "agent", "step"], "Int64"))
@@ -147,13 +163,16 @@ def collect(store: Store, selection: Selection) -> VectorFieldRecord:
     """Collect the vector fields of the runs. Raises InputError for a run without a vector field."""
     selection = selection if selection.named else _of_the_paper(selection)
     measured = _measured(store, selection)
-    chosen = [median_of([one for one in measured if one.label == group.label]) for group in selection.groups]
-    fields = tuple(_field(store, one) for one in chosen)
-    first = chosen[0].run
+    groups = [_with_field(store, [one for one in measured if one.label == group.label]) for group in selection.groups]
+    places = typical_runs([[(one.run.seed, one.behind) for one in of] for of in groups])
+    fields = tuple(_field(store, of[place]) for of, place in zip(groups, places, strict=True))
+    spacing = Plane(*(store.array(fields[0].run.id, name).astype(np.float64) for name in AXES)).spacing
+    frame = _frame(fields)
     return VectorFieldRecord(
         fields=fields,
         measured=measured,
-        spacing=Plane(*(store.array(first.id, name).astype(np.float64) for name in AXES)).spacing,
+        arrows=tuple(_arrows(field, frame, spacing) for field in fields),
+        frame=frame,
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
         notes=(*selection.notes, *_notes(measured, fields)),
     )
@@ -172,13 +191,13 @@ def _of_the_paper(selection: Selection) -> Selection:
     return Selection(groups, (*selection.notes, note))
 
 
-def median_of(measured: Sequence[Measured]) -> Measured:
-    """Return the run with the median behind cosine, the lower of two, among the runs that have one."""
-    known = [one for one in measured if np.isfinite(one.behind)]
-    if not known:
+def _with_field(store: Store, measured: Sequence[Measured]) -> list[Measured]:
+    """The runs of one range whose vector field is stored. Raises InputError when there is none."""
+    needed = {f"vector_field/{kind}" for kind in FIELD}
+    found = [one for one in measured if np.isfinite(one.behind) and needed <= {*store.array_names(one.run.id)}]
+    if not found:
         raise InputError(f"no run with alpha in {measured[0].label} has a vector field; leave them out.")
-    ranked = sorted(known, key=lambda one: (one.behind, one.run.seed))
-    return ranked[(len(ranked) - 1) // 2]
+    return found
 
 
 def _measured(store: Store, selection: Selection) -> tuple[Measured, ...]:
@@ -198,7 +217,7 @@ def _field(store: Store, measured: Measured) -> Field:
     run = measured.run
     metrics = store.latest_metrics([run.id], names=[BEHIND])
     arrays = (store.array(run.id, f"vector_field/{kind}").astype(np.float64) for kind in FIELD)
-    return Field(measured.label, run, int(metrics["step"].iloc[0]), *arrays)
+    return Field(measured.label, run, int(metrics["step"].iloc[0]), measured.behind, *arrays)
 
 
 def _notes(measured: Sequence[Measured], fields: Sequence[Field]) -> list[str]:
@@ -208,32 +227,52 @@ def _notes(measured: Sequence[Measured], fields: Sequence[Field]) -> list[str]:
         numbers = ", ".join(f"{one.behind:.2f} (seed {one.run.seed})" for one in of)
         notes.append(
             f"alpha in {field.label}: after epoch {field.epoch} the mean cosine behind the current trajectory is "
-            f"{numbers}; seed {field.run.seed} is shown, the median."
+            f"{numbers}; seed {field.run.seed} is shown."
         )
+    if len({field.run.seed for field in fields}) > 1:
+        notes.append("no seed has a stored vector field for every range, so each range shows its median.")
     return notes
 
 
-def _arrows(field: Field) -> tuple[np.ndarray, ...]:
-    """Open-mesh indices (A, R', T') of the points that have arrows."""
-    alphas = np.arange(len(field.alpha))
-    steps = np.unique(np.linspace(0, field.current.shape[1] - 1, STEPS).round().astype(int))
-    return np.ix_(alphas, np.arange(min(TRAJECTORIES, len(field.current))), steps)
+def _frame(fields: Sequence[Field]) -> Frame:
+    """Left, right, bottom and top of the trajectories that are shown, with a margin.
+
+    A policy that goes far away widens the frame by at most FRAME_WIDENING times the expert's longer side.
+    """
+    current, expert = (
+        np.concatenate([getattr(field, kind)[:TRAJECTORIES].reshape(-1, 2) for field in fields])
+        for kind in ("current", "expert")
+    )
+    low, high = expert.min(axis=0), expert.max(axis=0)
+    reach = FRAME_WIDENING * (high - low).max()
+    seen = np.clip(current[np.isfinite(current).all(axis=1)], low - reach, high + reach)
+    (left, bottom), (right, top) = (f(np.concatenate([expert, seen]), axis=0) for f in (np.min, np.max))
+    margin = MARGIN * max(right - left, top - bottom)
+    return float(left - margin), float(right + margin), float(bottom - margin), float(top + margin)
 
 
-def _field_rows(field: Field) -> list[pd.DataFrame]:
-    named = {"label": field.label, "run_id": field.run.id, "seed": field.run.seed, "epoch": field.epoch}
-    shown = slice(TRAJECTORIES)
-    rows = [
-        landscape_grids.path_rows(getattr(field, kind)[shown], kind=kind, **named) for kind in ("current", "expert")
-    ]
-    at = _arrows(field)
-    alphas, trajectories, steps = (index.ravel() for index in at)
-    places, gradient, cosine = field.places[at], field.gradient[at], field.cosine[at]
-    a, r, t, agent = (index.ravel() for index in np.indices(cosine.shape))
-    columns = {"alpha": field.alpha[alphas[a]], "trajectory": trajectories[r], "step": steps[t], "agent": agent}
-    columns |= {"x": places[..., 0].ravel(), "y": places[..., 1].ravel(), "cosine": cosine.ravel()}
-    columns |= {"gradient_x": gradient[..., 0].ravel(), "gradient_y": gradient[..., 1].ravel()}
-    return [*rows, pd.DataFrame({"kind": "arrow", **named, **columns})]
+def _arrows(field: Field, frame: Frame, spacing: float) -> pd.DataFrame:
+    """Return [alpha, trajectory, step, agent, x, y, gradient_x, gradient_y, cosine], at most a row for each cell.
+
+    `spacing`: points closer to the expert than this have no arrow.
+    """
+    shown = np.s_[:, :TRAJECTORIES]
+    places, gradient, cosine = field.places[shown], field.gradient[shown], field.cosine[shown]
+    alpha, trajectory, step, agent = np.indices(cosine.shape)
+    columns = {"alpha": field.alpha[alpha], "trajectory": trajectory, "step": step, "agent": agent}
+    columns |= {"x": places[..., 0], "y": places[..., 1], "cosine": cosine}
+    columns |= {"gradient_x": gradient[..., 0], "gradient_y": gradient[..., 1]}
+    far = np.linalg.norm(field.expert[:TRAJECTORIES] - places, axis=-1) >= spacing
+    table = pd.DataFrame({name: values[far] for name, values in columns.items()})
+    left, right, bottom, top = frame
+    inside = table["x"].between(left, right) & table["y"].between(bottom, top)
+    table = table[inside & (table["gradient_x"].ne(0) | table["gradient_y"].ne(0))]
+    cell = max(right - left, top - bottom) / CELLS
+    across, up = (table["x"] - left) / cell, (table["y"] - bottom) / cell
+    cells = {"across": np.floor(across), "up": np.floor(up)}
+    away = np.hypot(across - cells["across"] - 0.5, up - cells["up"] - 0.5)
+    nearest = table.assign(**cells, away=away).sort_values("away", kind="stable").drop_duplicates(["across", "up"])
+    return nearest.sort_index().drop(columns=[*cells, "away"])
 
 
 def samples(runs: Runs) -> tuple[Sample, ...]:
@@ -254,54 +293,55 @@ def decide(positive: Sample, both: Sample) -> tuple[Part, ...]:
 
 
 def draw(record: VectorFieldRecord) -> Figure:
-    """Draw a panel for each range, side by side if the frame is tall and otherwise stacked, with the legend above."""
-    left, right, bottom, top = frame = record.frame
-    beside = top - bottom > 0.8 * (right - left)
-    rows, columns = (1, len(record.fields)) if beside else (len(record.fields), 1)
-    tall = float(np.clip(2.6 / columns * (top - bottom) / (right - left), 0.6, 3.0))
+    """Draw a panel for each range, one below the other, with the legend above and the colours of alpha below."""
+    left, right, bottom, top = record.frame
     with style.sheet():
-        figure = style.new_figure(height=0.9 + rows * (tall + 0.2))
-        panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
-        for axes, field in zip(panels, record.fields, strict=True):
-            _draw_field(axes, field, record.spacing)
-            axes.set(xlim=frame[:2], ylim=frame[2:])
-            axes.set_aspect("equal")
-            axes.grid(False)
-        landscape_grids.label_axes(list(panels), columns, record.fields[0].run.environment)
-        kinds = {"current trajectory": landscape_grids.POLICY, "expert": landscape_grids.EXPERT}
-        handles = [Line2D([], [], color=colour, lw=1.2, label=label) for label, colour in kinds.items()]
-        marks = {"slope towards the expert": TOWARDS, "away from it": AWAY}
-        handles += [
-            Line2D([], [], color=colour, ls="", marker=r"$\rightarrow$", ms=8, mew=0, label=label)
-            for label, colour in marks.items()
+        tall = float(np.clip(2.8 * (top - bottom) / (right - left), 0.8, 3.2))
+        figure = style.new_figure(height=0.9 + len(record.fields) * (tall + 0.2))
+        panels = figure.subplots(len(record.fields), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        for axes, field, arrows in zip(panels, record.fields, record.arrows, strict=True):
+            quiver = _draw_field(axes, field, arrows, record.frame)
+        landscape_grids.label_axes(list(panels), 1, record.fields[0].run.environment)
+        bar = figure.colorbar(quiver, ax=list(panels), location="bottom", aspect=40, fraction=0.04, pad=0.02)
+        bar.set_label(r"$\alpha$, the label of the point (below 0: behind)", fontsize=7)
+        bar.set_ticks([-1, -0.5, 0, 0.5, 1])
+        names = {"expert": "expert", "current": "current trajectory"}
+        handles = [
+            Line2D([], [], color=style.REFERENCE, lw=1.2, ls=LINES[kind], label=name) for kind, name in names.items()
         ]
         figure.legend(handles=handles, loc="outside upper center", ncols=2)
         return figure
 
 
-def _draw_field(axes: Axes, field: Field, spacing: float) -> None:
-    shown = slice(TRAJECTORIES)
-    landscape_grids.draw_paths(axes, field.expert[shown], landscape_grids.EXPERT, lw=1.0)
-    landscape_grids.draw_paths(axes, field.current[shown], landscape_grids.POLICY, lw=1.0)
-    at = _arrows(field)
-    found = (field.places, field.gradient, field.cosine)
-    places, gradient, cosine = (values[at].reshape(-1, *values.shape[4:]) for values in found)
-    lengths = np.linalg.norm(gradient, axis=-1, keepdims=True)
-    far = np.linalg.norm(field.expert - field.places, axis=-1)[at].ravel() >= spacing
-    arrows = gradient / np.maximum(lengths, 1e-12)
-    for towards, colour in ((True, TOWARDS), (False, AWAY)):
-        use = far & ((cosine > 0) == towards) & (lengths[:, 0] > 0)
-        if not use.any():
-            continue
-        axes.quiver(
-            *places[use].T,
-            *arrows[use].T,
-            color=colour,
-            scale=1 / ARROW,
-            scale_units="width",
-            width=0.006,
-            headwidth=4,
-            pivot="tail",
-            zorder=3,
-        )
-    axes.set_title(rf"$\alpha$ in {style.literal(field.label)}, seed {field.run.seed}", fontsize=7, pad=2)
+def _draw_field(axes: Axes, field: Field, arrows: pd.DataFrame, frame: Frame) -> Quiver:
+    left, right, bottom, top = frame
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+    axes.set_aspect("equal")
+    axes.grid(False)
+    for kind, line in LINES.items():
+        paths = getattr(field, kind)[:TRAJECTORIES]
+        landscape_grids.draw_paths(axes, paths, style.REFERENCE, lw=1.2, ls=line)
+    length = max(right - left, top - bottom) / CELLS * ARROW
+    slope = arrows[["gradient_x", "gradient_y"]].to_numpy()
+    colours = matplotlib.colormaps[MAP](np.linspace(DARKEST, BRIGHTEST, 256))
+    quiver = axes.quiver(
+        arrows["x"],
+        arrows["y"],
+        *(slope / np.linalg.norm(slope, axis=1, keepdims=True)).T * length,
+        arrows["alpha"],
+        cmap=ListedColormap(colours),
+        norm=Normalize(-1, 1),
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        units="xy",
+        width=length / 7,
+        headwidth=4,
+        headlength=4,
+        headaxislength=3.5,
+        pivot="mid",
+        zorder=3,
+    )
+    title = rf"$\alpha$ in {style.literal(field.label)}, seed {field.run.seed} (mean cosine behind: {field.behind:.2f})"
+    axes.set_title(title, fontsize=7, pad=2)
+    return quiver

@@ -60,6 +60,15 @@ class CurriculaRecord:
     provenance: Provenance
     notes: tuple[str, ...]
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        return (
+            "Mean length of the segments that the policy generates between two interventions, over epochs, under each "
+            f"curriculum, on a logarithmic scale. {curves.in_words(self.bands, self.statistic)} Dashed: the expected "
+            "length, T / (1 + (T - 1) f), for T steps and the epoch's probability f of an intervention at a step."
+        )
+
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, value, low, high]; kind: run, mean or median, diverged, closed form."""
         rows = [row for shown in self.bands for row in shown.rows(self.statistic)]
@@ -143,4 +152,4 @@ def _length_axis(axes: Axes, record: CurriculaRecord) -> None:
     axes.yaxis.set_major_locator(FixedLocator([step * 10**power for power in range(4) for step in (1, 2, 5)]))
     axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.set_ylabel("mean segment length (steps)")
+    axes.set_ylabel("mean segment length\n(steps, logarithmic scale)")

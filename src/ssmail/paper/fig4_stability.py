@@ -1,14 +1,16 @@
 """Figure 4 (section 4.2): the training error on Y-Junction over epochs, for every seed of every adversarial method.
 
 The error is `train/mode_mse`: the position MSE of sampled rollouts from training starts to the nearer of the expert's
-lanes, in squared scaled units. Each method has a panel, all on one logarithmic scale. Thin lines are seeds; the thick
-line and the band are centre and spread over **all** runs of the method (`ssmail.evaluation.statistics`). The centres of
-the other methods are repeated in each panel. No run is dropped: a diverged run ends in a cross at the top edge, is
-counted in the title, and leaves the mean undefined. The dotted line is the test error of constant velocity, that is of
-driving straight on. The scale ends at `curves.CEILING`, the error of a rollout whose every position is as far off as
-counts as diverged; a note reports runs that rise above it.
+lanes, in squared scaled units, on a logarithmic scale. One panel compares the methods: a line and a band are centre and
+spread over **all** runs of a method (`ssmail.evaluation.statistics`). Below it, a small panel on the same scale shows
+each run of each method. No run is dropped: a diverged run ends in a cross at the top edge, is counted in the legend,
+and leaves a mean undefined. The dotted line is the test error of constant velocity, that is of driving straight on. The
+scale ends at `curves.CEILING`, the error of a rollout whose every position is as far off as counts as diverged; a note
+reports runs that rise above it.
 
-Deviation: the paper's figure shows only mean and standard deviation, and its authors discarded runs that failed.
+Deviation: the paper's figure shows only mean and standard deviation, and its authors discarded runs that failed. Here
+median and quartiles are the default, because a mean less a standard deviation is often negative, where a logarithmic
+scale ends.
 
 Claim C1: SS-AIL converges for every seed; GAIL and WAIL do not, and fluctuate. The paper reports a training error; a
 policy that converged has a small validation error as well, so both have to be small. "Converges to zero" means: below a
@@ -21,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ssmail.data.trajectories import Floats
@@ -48,6 +51,7 @@ CLAIM = Claim(
 )
 METHODS = ("ssail", "gail", "wail")
 CONVERGED = 0.1  # of constant velocity's error
+COLUMNS = 3  # of small panels
 SMALLEST = 1e-12  # squared scaled units: a smaller error counts as this, so that it has a logarithm
 REMAINING = (
     "mode_mse, mean of the last fifth of the epochs, as a fraction of constant velocity's test error; "
@@ -65,6 +69,18 @@ class StabilityRecord:
     constant_velocity: float | None  # squared scaled units; None when no run finished
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        several = len(self.bands) > 1
+        words = curves.in_words(self.bands, self.statistic, runs=not several)
+        small = " The small panels show each run at the same scale." if several else ""
+        return (
+            "Training error on Y-Junction over epochs: the squared distance of sampled rollouts to the nearest of the "
+            f"expert's lanes, in squared scaled units. {words}{small} Dotted: "
+            "the test error of constant velocity, that is of driving straight on."
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, epoch, value, low, high].
@@ -123,27 +139,36 @@ def decide(remaining: Sequence[Sample], fluctuations: Sequence[Sample]) -> tuple
 
 
 def draw(record: StabilityRecord) -> Figure:
-    """Draw stacked panels, one for each method, on one logarithmic scale, with the legend above."""
+    """Draw centre and spread of all methods in one panel, and below it the runs of each method, at the same scale.
+
+    A single method has its runs in the one panel.
+    """
     with style.sheet():
-        figure = style.new_figure(height=1.0 + max(1.05 * len(record.bands), 1.5))
-        panels = figure.subplots(len(record.bands), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+        alone = len(record.bands) == 1
+        rows = 0 if alone else -(-len(record.bands) // COLUMNS)
+        figure = style.new_figure(height=2.8 + 0.95 * rows)
+        grid = figure.add_gridspec(1 + rows, COLUMNS, height_ratios=[2.2, *[1] * rows])
+        axes = figure.add_subplot(grid[0, :])
         others = [] if record.constant_velocity is None else [record.constant_velocity]
         strokes = style.strokes([shown.label for shown in record.bands])
-        style.log_axis(panels[0], curves.limits(record.bands, others))
-        handles = []
-        for axes, shown in zip(panels, record.bands, strict=True):
-            for other in record.bands:
-                if other is not shown:
-                    curves.draw_centre(axes, other, strokes[other.label], lw=0.7, alpha=0.8)
-            handles.append(curves.draw_band(axes, shown, strokes[shown.label]))
-            handles[-1].set_label(style.literal(shown.label))
-            axes.set_title(curves.count_label(shown), loc="left", fontsize=7, weight="bold", pad=5)
-            if record.constant_velocity is not None:
-                reference = style.draw_reference(axes, record.constant_velocity)
-        if record.constant_velocity is not None:
-            handles.append(reference)
-        style.epoch_axis(panels[-1])
-        figure.supylabel("training error, mode_mse (squared scaled units)", fontsize=8)
-        title = curves.legend_title(record.statistic)
+        style.log_axis(axes, curves.limits(record.bands, others))
+        draw_methods = curves.draw_band if alone else curves.draw_spread
+        handles = [draw_methods(axes, shown, strokes[shown.label]) for shown in record.bands]
+        handles += [style.draw_reference(axes, error) for error in others]
+        axes.set_ylabel("squared error to the\nnearest lane (scaled units²)")
+        style.epoch_axis(axes)
+        for place, shown in enumerate(record.bands if rows else ()):
+            panel = figure.add_subplot(grid[1 + place // COLUMNS, place % COLUMNS], xlim=axes.get_xlim(), sharey=axes)
+            _draw_runs(panel, shown, strokes[shown.label], left=place % COLUMNS == 0)
+        title = curves.legend_title(record.statistic, runs=alone)
         figure.legend(handles=handles, loc="outside upper center", ncols=2, title=title)
         return figure
+
+
+def _draw_runs(axes: Axes, shown: Band, stroke: style.Stroke, left: bool) -> None:
+    """Draw the runs of one method in a small panel, whose scale is that of the large one."""
+    curves.draw_runs(axes, shown, stroke)
+    axes.set_title(f"{style.literal(shown.label)}, every run", fontsize=7, color=stroke.colour, pad=3)
+    axes.tick_params(labelleft=left)
+    style.epoch_axis(axes)
+    axes.xaxis.label.set_fontsize(7)

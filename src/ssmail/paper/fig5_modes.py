@@ -1,13 +1,12 @@
-"""Figure 5 (section 4.3): where the trained policy of each seed goes on Y-Junction, drawn over the expert's two lanes.
+"""Figure 5 (section 4.3): where the trained policy of each seed goes on Y-Junction, drawn over the road.
 
 Each panel shows sampled rollouts of the best-validation model: one for each of STARTS starts, which are spread over the
-test split, from the samples in turn. A dot marks the end of each agent. Grey lines are the expert's continuations of
-the same starts into both lanes; they are wide only to be visible beneath the rollouts. The numbers in a panel are the
-stored test metrics over *all* starts and samples: `test/on_path` (agents whose whole path stays within a step length
-of a lane), `test/path_rms` (their distance from it, in step lengths) and `test/lane_balance` (rollouts that take the
-rarer lane, at most 50 %). A run stored before there were the first two has those of its stored rollouts instead, which
-a note counts. The panel of a diverged run says that it has no test rollouts. Rollouts that leave the frame are cut
-there and counted.
+test split, from the samples in turn. A dot marks the end of each agent. The grey strip is what counts as on the path:
+all points within a step length of a lane's centre line. An agent whose whole path stays in it has one colour, and an
+agent that leaves it another. The numbers in a panel count what it shows: the share of agents on the path
+(`ssmail.evaluation.metrics.path_metrics`), and the rollouts that take each lane. A note has the same metrics over *all*
+test rollouts, as stored. The panel of a diverged run says that it has no test rollouts. Rollouts that leave the frame
+are cut there and counted.
 
 Deviation: the paper shows one set of trajectories for each method; here every seed has its panel.
 
@@ -17,7 +16,7 @@ modes apart either, so both lanes have to be used. Its rule was fixed when there
 `test/on_lane`, which looks at the end of a path only.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,22 +24,25 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from ssmail.data.trajectories import Floats, Integers
+from ssmail.data.trajectories import Booleans, Floats, Integers
+from ssmail.evaluation.metrics import ON_PATH_TOLERANCE, nearest_mode, path_distances, stays_on_path
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import median_seed
 from ssmail.paper.samples import LEAST, Runs
 from ssmail.plots import style
-from ssmail.plots.landscape_grids import draw_paths, path_rows
+from ssmail.plots.landscape_grids import path_rows
 from ssmail.plots.provenance import Provenance
+from ssmail.plots.road import draw_strip, lengthened
 from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import known_values
+from ssmail.store.computed_metrics import centre_lines
 
 NAME = "fig5"
 STARTS = 16
-ON_LANE, LANE_BALANCE = "test/on_lane", "test/lane_balance"
-ON_PATH, PATH_RMS = "test/on_path", "test/path_rms"
+ON_LANE, LANE_BALANCE, ON_PATH = "test/on_lane", "test/lane_balance", "test/on_path"
 ROLLOUTS, LANES, CENTRES = "test/rollouts", "test/lanes", "lane_centres"
 CLAIM = Claim(
     name="C2",
@@ -59,7 +61,8 @@ BETWEEN_STATISTIC = (
     "continuations of their start, nearer to its middle than to either end"
 )
 FRAME_WIDENING = 0.2  # a stray rollout widens the frame by at most this share of the expert's larger side
-LANE_WIDTH = 3.5  # points
+STAYS, LEAVES = "#0072B2", "#D55E00"  # colours of agents on the path and off it
+COLUMNS = 5  # panels beside each other, at most
 ORDER = ["trajectory", "agent", "step"]  # of the rows
 
 Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
@@ -67,15 +70,19 @@ Frame = tuple[float, float, float, float]  # x from, x to, y from, y to
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """The rollouts of one run."""
+    """The rollouts of one run, which has none when it diverged."""
 
     label: str
     run_id: str
     seed: int
-    rollouts: Floats | None  # (R, T, N, 2) step lengths; None when the run diverged
-    on_path: float  # 0..1 over all rollouts; NaN when unknown, as of a run that diverged
-    path_rms: float  # step lengths likewise
-    lane_balance: float  # 0..0.5 likewise
+    rollouts: Floats | None  # (R, T, N, 2) step lengths
+    stays: Booleans | None  # (R, N) whether an agent is on the path throughout; None when the lanes are unknown too
+    lanes: Integers | None  # (R,) the lane that each rollout takes
+
+    @property
+    def on_path(self) -> float:
+        """The share of the agents that stay on the path; NaN when it is unknown."""
+        return np.nan if self.stays is None else float(self.stays.mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,23 +90,37 @@ class ModesRecord:
     """The contents of figure 5. Positions are in step lengths (the approach speed times one step)."""
 
     panels: tuple[Panel, ...]
-    expert: Floats  # (L, R, T, N, 2) continuations of the shown starts into each lane; empty when all runs diverged
+    centre_lines: Floats  # (L, P, 2) of the lanes; empty when they are unknown
     frame: Frame
     provenance: Provenance
     notes: tuple[str, ...]
 
-    def table(self) -> pd.DataFrame:
-        """[kind, label, run_id, seed, on_path, path_rms, lane_balance, lane, trajectory, agent, step, x, y].
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        return (
+            "Sampled rollouts of the best-validation model of every seed on Y-Junction, from "
+            f"{STARTS} starts spread over the test split; a dot marks where an agent ends. Grey: all points within "
+            f"{ON_PATH_TOLERANCE:g} step length of a lane's centre line. Agents whose whole path stays there are blue, "
+            "the others orange. The numbers count what is shown: the share of such agents, and the rollouts that take "
+            "each lane."
+        )
 
-        kind: expert, rollout, or diverged (one row without a position). Steps count from 0.
+    def table(self) -> pd.DataFrame:
+        """[kind, label, run_id, seed, lane, on_path, trajectory, agent, step, x, y].
+
+        kind: rollout, diverged (one row without a position), or centre line (step counts its points). lane: the one
+        that the rollout takes. on_path: 1 for an agent that stays on the path, 0 for one that leaves it.
         """
-        lanes = [
-            path_rows(lane, kind="expert", lane=index).sort_values(ORDER) for index, lane in enumerate(self.expert)
+        lines = [
+            pd.DataFrame(
+                {"kind": "centre line", "lane": lane, "step": range(len(line)), "x": line[:, 0], "y": line[:, 1]}
+            )
+            for lane, line in enumerate(self.centre_lines)
         ]
-        table = pd.concat([*lanes, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
-        order = ["kind", "label", "run_id", "seed", "on_path", "path_rms", "lane_balance", "lane"]
-        table = table.reindex(columns=[*order, "trajectory", "agent", "step", "x", "y"])
-        return table.astype(dict.fromkeys(["seed", "lane", "trajectory", "agent", "step"], "Int64"))
+        table = pd.concat([*lines, *(_panel_rows(panel) for panel in self.panels)], ignore_index=True)
+        order = ["kind", "label", "run_id", "seed", "lane", "on_path", "trajectory", "agent", "step", "x", "y"]
+        return table.reindex(columns=order).astype(dict.fromkeys(["seed", *order[4:-2]], "Int64"))
 
     def outside(self, panel: Panel) -> int:
         """Count the panel's rollouts that leave the frame or are not finite."""
@@ -116,14 +137,14 @@ def collect(store: Store, selection: Selection) -> ModesRecord:
     check_settled(selection.runs, "test rollouts")
     finished = [run for run in selection.runs if run.state is RunState.FINISHED]
     expert = shown_lanes(store.array(finished[0].id, LANES)) if finished else np.empty((0, 0, 0, 0, 2))
-    values, computed = known_values(store, selection.runs, [ON_PATH, PATH_RMS, LANE_BALANCE])
-    panels = tuple(_panel(store, run, group.label, values) for group in selection.groups for run in group.runs)
+    lines = centre_lines(store, finished[0]) if finished else None
+    panels = tuple(_panel(store, run, group.label, expert, lines) for group in selection.groups for run in group.runs)
     return ModesRecord(
         panels=panels,
-        expert=expert,
+        centre_lines=np.empty((0, 0, 2)) if lines is None else lines,
         frame=_frame(expert, [panel.rollouts for panel in panels if panel.rollouts is not None]),
         provenance=Provenance.of(NAME, selection.runs, curves=selection.curves),
-        notes=(*selection.notes, *([computed] if computed else [])),
+        notes=(*selection.notes, *_notes(store, selection)),
     )
 
 
@@ -159,20 +180,38 @@ def _frame(expert: Floats, rollouts: Sequence[Floats]) -> Frame:
     return (float(low[0] - margin), float(high[0] + margin), float(low[1] - margin), float(high[1] + margin))
 
 
-def _panel(store: Store, run: RunRow, label: str, values: Mapping[tuple[str, str], float]) -> Panel:
+def _panel(store: Store, run: RunRow, label: str, expert: Floats, lines: Floats | None) -> Panel:
     if run.state is RunState.DIVERGED:
-        return Panel(label, run.id, run.seed, None, np.nan, np.nan, np.nan)
+        return Panel(label, run.id, run.seed, None, None, None)
     rollouts = shown_rollouts(store.array(run.id, ROLLOUTS))[0]
-    numbers = (values.get((run.id, name), np.nan) for name in (ON_PATH, PATH_RMS, LANE_BALANCE))
-    return Panel(label, run.id, run.seed, rollouts, *numbers)
+    predicted = rollouts[:, 1:].astype(np.float64)
+    stays = None if lines is None else stays_on_path(path_distances(predicted, lines))
+    return Panel(label, run.id, run.seed, rollouts, stays, nearest_mode(predicted, expert[:, :, 1:]))
+
+
+def _notes(store: Store, selection: Selection) -> list[str]:
+    """The metrics of the panels over all test rollouts, as far as they are known."""
+    values, computed = known_values(store, selection.runs, [ON_PATH, LANE_BALANCE])
+    notes = [
+        f"{group.label}: over all test rollouts {name} is "
+        + ", ".join(f"{_percent(values.get((run.id, name), np.nan))} (seed {run.seed})" for run in group.runs)
+        + "."
+        for group in selection.groups
+        for name in (ON_PATH, LANE_BALANCE)
+    ]
+    return [*notes, f"{computed}."] if computed else notes
 
 
 def _panel_rows(panel: Panel) -> pd.DataFrame:
     run = {"label": panel.label, "run_id": panel.run_id, "seed": panel.seed}
     if panel.rollouts is None:
         return pd.DataFrame([{"kind": "diverged", **run}])
-    numbers = {"on_path": panel.on_path, "path_rms": panel.path_rms, "lane_balance": panel.lane_balance}
-    return path_rows(panel.rollouts, kind="rollout", **run, **numbers).sort_values(ORDER)
+    rows = path_rows(panel.rollouts, kind="rollout", **run).sort_values(ORDER)
+    if panel.lanes is not None:
+        rows["lane"] = panel.lanes[rows["trajectory"]]
+    if panel.stays is not None:
+        rows["on_path"] = panel.stays[rows["trajectory"], rows["agent"]].astype(np.int64)
+    return rows
 
 
 def share_between(rollouts: Floats, lanes: Floats) -> float:
@@ -207,70 +246,81 @@ def decide(on_lane: Sample, balance: Sample, between: Sample) -> tuple[Part, ...
 
 
 def draw(record: ModesRecord) -> Figure:
-    """Draw the panels in two columns at equal scale.
-
-    Two labels have a column each, with the label above it. Otherwise the panels fill the columns in turn; with more
-    than two labels, each panel names its own.
-    """
-    labels = list(dict.fromkeys(panel.label for panel in record.panels))
-    cells = _cells(record.panels, labels)
+    """Draw the panels at equal scale, each label from a row of its own on, at the width of a page."""
+    cells = _cells(record.panels)
     rows, columns = (max(place[i] for place in cells) + 1 for i in (0, 1))
     with style.sheet():
         left, right, bottom, top = record.frame
-        panel_height = float(np.clip(1.35 * (top - bottom) / (right - left), 0.6, 2.0)) + 0.15  # inches, with the gap
-        figure = style.new_figure(height=0.6 + rows * panel_height)
+        width = style.PAGE_WIDTH if columns > 2 else style.COLUMN_WIDTH
+        side = (width - 0.6) / columns  # inches, with the gap
+        tall = float(np.clip(side * (top - bottom) / (right - left), 0.6, 2.5)) + 0.2
+        figure = style.new_figure(height=0.6 + rows * tall, width=width)
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        strokes = style.strokes(labels)
         for (row, column), axes in np.ndenumerate(grid):
             panel = cells.get((row, column))
             if panel is None:
                 axes.set_axis_off()
                 continue
             axes.tick_params(labelbottom=(row + 1, column) not in cells)
-            if len(labels) == 2 and row == 0:
-                axes.set_title(style.literal(panel.label), weight="bold", pad=4)
-            title = f"{style.literal(panel.label)}\nseed {panel.seed}" if len(labels) > 2 else f"seed {panel.seed}"
-            _draw_panel(axes, panel, record, title, strokes[panel.label].colour)
+            _draw_panel(axes, panel, record)
         figure.supxlabel("x (step lengths)", fontsize=8)
         figure.supylabel("y (step lengths)", fontsize=8)
-        handles = [Line2D([], [], color=style.LANE, lw=LANE_WIDTH, label="expert, both lanes")]
-        handles += [
-            Line2D([], [], color=strokes[label].colour, lw=1.2, label=f"{style.literal(label)}, sampled")
-            for label in labels
+        strip = f"within {ON_PATH_TOLERANCE:g} step length of a lane's centre line"
+        handles = [
+            Patch(color=style.LANE, lw=0, label=strip),
+            Line2D([], [], color=STAYS, lw=1.2, label="agent that stays there"),
+            Line2D([], [], color=LEAVES, lw=1.2, label="agent that leaves"),
         ]
-        figure.legend(handles=handles, loc="outside upper center", ncols=min(len(handles), 3), columnspacing=1.2)
+        figure.legend(handles=handles, loc="outside upper center", ncols=3 if columns > 2 else 1, columnspacing=1.2)
         return figure
 
 
-def _cells(panels: Sequence[Panel], labels: Sequence[str]) -> dict[tuple[int, int], Panel]:
-    """Return the panels by (row, column)."""
-    if len(labels) != 2:
-        return {(i // 2, i % 2): panel for i, panel in enumerate(panels)}
-    columns = [[panel for panel in panels if panel.label == label] for label in labels]
-    return {(i, j): panel for j, column in enumerate(columns) for i, panel in enumerate(column)}
+def _cells(panels: Sequence[Panel]) -> dict[tuple[int, int], Panel]:
+    """Return the panels by (row, column). A single label of a few seeds stands in two columns."""
+    labels = list(dict.fromkeys(panel.label for panel in panels))
+    columns = 2 if len(labels) == 1 and len(panels) <= 4 else COLUMNS
+    cells: dict[tuple[int, int], Panel] = {}
+    row = 0
+    for label in labels:
+        own = [panel for panel in panels if panel.label == label]
+        cells |= {(row + i // columns, i % columns): panel for i, panel in enumerate(own)}
+        row += -(-len(own) // columns)
+    return cells
 
 
-def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord, title: str, colour: str) -> None:
+def _draw_panel(axes: Axes, panel: Panel, record: ModesRecord) -> None:
+    left, right, bottom, top = record.frame
     axes.set_aspect("equal")
-    axes.set(xlim=record.frame[:2], ylim=record.frame[2:])
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.grid(False)
-    for lane in record.expert:
-        draw_paths(axes, lane, style.LANE, lw=LANE_WIDTH)
+    axes.set_title(f"{style.literal(panel.label)}, seed {panel.seed}", fontsize=7, pad=3)
+    for line in record.centre_lines:
+        draw_strip(axes, lengthened(line, right - left), ON_PATH_TOLERANCE)
     if panel.rollouts is None:
         words = ["diverged:", "no test rollouts"]
     else:
-        draw_paths(axes, panel.rollouts, colour, lw=0.4, alpha=0.8)
-        ends = panel.rollouts[:, -1].reshape(-1, 2)
-        axes.plot(ends[:, 0], ends[:, 1], ".", color=colour, ms=1.8, mew=0)
-        words = [
-            f"{_percent(panel.on_path)} on path",
-            f"rms {'-' if np.isnan(panel.path_rms) else f'{panel.path_rms:.2g}'}",
-            f"rarer lane {_percent(panel.lane_balance)}",
-        ]
+        _draw_rollouts(axes, panel.rollouts, panel.stays)
+        words = [f"{_percent(panel.on_path)} on path"]
+        if panel.lanes is not None:
+            counts = np.bincount(panel.lanes, minlength=len(record.centre_lines))
+            words.append(f"lanes {' : '.join(map(str, counts))}")
         if outside := record.outside(panel):
             words.append(f"{outside} of {len(panel.rollouts)} cut off")
-    axes.text(0.03, 0.97, title, transform=axes.transAxes, va="top", fontsize=7, weight="bold")
-    axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=6)
+    axes.text(0.03, 0.03, "\n".join(words), transform=axes.transAxes, va="bottom", fontsize=7)
+
+
+def _draw_rollouts(axes: Axes, rollouts: Floats, stays: Booleans | None) -> None:
+    """Draw the track of every agent, with a dot at its end. Those that stay on the path are on top."""
+    for colour, kept in ((LEAVES, False), (STAYS, True)):
+        tracks = [
+            rollouts[r, :, n]
+            for r, n in np.ndindex(rollouts.shape[0], rollouts.shape[2])
+            if (stays is None or bool(stays[r, n])) == kept
+        ]
+        for track in tracks:
+            axes.plot(*track.T, color=colour, lw=0.5, alpha=0.8, solid_capstyle="round")
+        if tracks:
+            axes.plot(*np.array([track[-1] for track in tracks]).T, ".", color=colour, ms=2, mew=0)
 
 
 def _percent(share: float) -> str:

@@ -37,7 +37,7 @@ from ssmail.paper.samples import WORST, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, constant_velocity
 from ssmail.plots.formatting import setting
-from ssmail.plots.metric_units import last_part
+from ssmail.plots.metric_units import WORDS, last_part, named
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
@@ -77,6 +77,16 @@ class AlphaRecord:
     constant_velocity: float | None  # squared scaled units; None when no run finished
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        return (
+            f"Training over epochs for the ranges that alpha is drawn from: above, the {WORDS[last_part(self.error)]} "
+            "of sampled rollouts on training trajectories, in squared scaled units; below, the discriminator's loss on "
+            "generated and expert trajectories, which is 1/2 for a constant output of 1/2. "
+            f"{curves.in_words(self.errors, self.statistic)} Dotted: the test error of constant velocity."
+        )
 
     def table(self) -> pd.DataFrame:
         """[metric, kind, label, run_id, seed, epoch, value, low, high].
@@ -153,10 +163,10 @@ def draw(record: AlphaRecord) -> Figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=[3, 2])
         reference = [] if record.constant_velocity is None else [record.constant_velocity]
         style.log_axis(upper, curves.limits(record.errors, reference))
-        upper.set_ylabel(f"training error, {last_part(record.error)}\n(squared scaled units)")
+        upper.set_ylabel(named(record.error, "training"))
         low, high = curves.linear_limits(record.losses)
         lower.set_ylim(min(low, 0), max(high, 1.1 * UNDECIDED))
-        lower.set_ylabel("loss of D\n" r"on $\tau_G$ and $\tau_E$")
+        lower.set_ylabel("discriminator loss\n" r"on $\tau_G$ and $\tau_E$")
         strokes = style.strokes([shown.label for shown in record.errors])
         handles = []
         for above, below in zip(record.errors, record.losses, strict=True):

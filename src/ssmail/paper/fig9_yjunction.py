@@ -15,7 +15,9 @@ from matplotlib.figure import Figure
 
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.plots import style
+from ssmail.plots.formatting import listed
 from ssmail.plots.provenance import Provenance
+from ssmail.plots.road import draw_strip
 from ssmail.plots.run_groups import Reads, Selection
 from ssmail.store import Store
 
@@ -38,6 +40,16 @@ class YJunctionRecord:
     fork: tuple[float, float]  # the last point that all centre lines share
     provenance: Provenance
     notes: tuple[str, ...]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        steps = listed([str(step) for step in self.steps])
+        return (
+            "The Y-Junction: the road with its lanes, and the expert's first training trajectory on each lane, with "
+            f"its agents at steps {steps} (filled and open markers tell the lanes apart). The road is drawn twice as "
+            "wide as the expert's trajectories stray from the centre lines."
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, lane, agent, step, x, y]; kind: centre line (step counts its points), trajectory, agent, or fork."""
@@ -101,22 +113,13 @@ def draw(record: YJunctionRecord) -> Figure:
 
 def _draw_road(axes: Axes, record: YJunctionRecord) -> None:
     for lane, line in enumerate(record.centre_lines):
-        edge = _outline(line, record.half_width)
-        axes.fill(edge[:, 0], edge[:, 1], color=style.LANE, lw=0, zorder=0)
+        draw_strip(axes, line, record.half_width)
         axes.plot(line[:, 0], line[:, 1], color="white", lw=0.8, ls=(0, (6, 4)), zorder=1, gid=f"centre-line-{lane}")
         axes.annotate(f"lane {lane}", line[-1], xytext=(4, 0), textcoords="offset points", va="center", fontsize=7)
     axes.plot(*record.fork, "+", color=style.REFERENCE, ms=6, mew=0.8, zorder=4)
     for name, (x, y) in (("fork", record.fork), ("street", (record.centre_lines[0, 0] + record.fork) / 2)):
         below = (x, y - record.half_width)
         axes.annotate(name, below, xytext=(0, -4), textcoords="offset points", ha="center", va="top", fontsize=7)
-
-
-def _outline(line: Floats, half_width: float) -> Floats:
-    """The outline (2 P, 2) of a strip along a line (P, 2)."""
-    along = np.gradient(line, axis=0)
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
-    sideways = half_width * np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return np.concatenate([line + sideways, (line - sideways)[::-1]])
 
 
 def _draw_agents(axes: Axes, trajectory: Floats, steps: Integers, first: bool) -> None:

@@ -31,9 +31,14 @@ class FigureModule:
     name: str
     alias: str
     summary: str
-    has_statistic: bool = False  # whether its centre and spread can be chosen
+    statistic: str = ""  # its centre and spread unless another is chosen; empty for a figure that has none
     has_environment: bool = False  # whether it can be drawn for another environment
     of_data: bool = False  # whether it draws the expert set, which any run may hold, and no runs
+
+    @property
+    def has_statistic(self) -> bool:
+        """Whether its centre and spread can be chosen."""
+        return bool(self.statistic)
 
     @property
     def stem(self) -> str:
@@ -52,14 +57,15 @@ class FigureModule:
         """Collect the record from `store`.
 
         `runs` (ids or their beginnings) replace the default choice of runs, which `profile` restricts. `statistic`
-        (mean-std by default) and `environment` (the paper's by default) have no effect on figures without that option.
+        (the figure's own by default) and `environment` (the paper's by default) have no effect on figures without that
+        option.
         Raises NoRuns when there is nothing to draw, InputError for an unknown or unfit id.
         """
         from ssmail.evaluation.statistics import Statistic
         from ssmail.plots.series import select, select_data
 
         module = self._module()
-        options = [statistic or Statistic.MEAN_STD] if self.has_statistic else []
+        options = [statistic or Statistic(self.statistic)] if self.has_statistic else []
         with stored_values(self.name):
             if self.of_data:
                 selection = select_data(store, self.name, {*self.reads.arrays}, runs, profile)
@@ -95,13 +101,15 @@ class FigureModule:
 _MODULES = (
     FigureModule("fig1", "landscapes", "letters: the task, and the reward over the plane, ideal and learned"),
     FigureModule("fig2", "vector-field", "letters: the learned reward's gradient around the current trajectory"),
-    FigureModule("fig3", "curricula", "segment lengths over epochs, under each curriculum", has_statistic=True),
-    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", has_statistic=True),
+    FigureModule("fig3", "curricula", "segment lengths over epochs, under each curriculum", statistic="median-iqr"),
+    FigureModule("fig4", "stability", "Y-Junction: training error over epochs, every seed", statistic="median-iqr"),
     FigureModule("fig5", "modes", "Y-Junction: sampled trajectories over the expert's two lanes, every seed"),
-    FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", has_statistic=True),
-    FigureModule("fig7", "noise", "mocap: test error against the predicted step, clean and noisy", has_statistic=True),
+    FigureModule("fig6", "beta", "Y-Junction: test error against beta, every seed", statistic="median-iqr"),
     FigureModule(
-        "fig8", "alpha", "mocap: training over epochs for ranges of alpha", has_statistic=True, has_environment=True
+        "fig7", "noise", "mocap: test error against the predicted step, clean and noisy", statistic="mean-std"
+    ),
+    FigureModule(
+        "fig8", "alpha", "mocap: training over epochs for ranges of alpha", statistic="median-iqr", has_environment=True
     ),
     FigureModule("fig9", "yjunction", "Y-Junction: a snapshot of the environment", of_data=True),
 )

@@ -32,6 +32,11 @@ class FigureRecord(Protocol):
         """Sentences for the reader: which runs were chosen, and what was left out."""
         ...
 
+    @property
+    def caption(self) -> str:
+        """What the figure shows, in a few sentences that a paper could use."""
+        ...
+
     def table(self) -> "pd.DataFrame":
         """Exactly what is shown, one row for each point."""
         ...

@@ -173,12 +173,22 @@ def draw_band(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> Lin
 
     `line` changes how the centre looks. Returns its line, which has `count_label` as its label.
     """
+    draw_runs(axes, shown, stroke)
+    return draw_spread(axes, shown, stroke, **line)
+
+
+def draw_runs(axes: Axes, shown: Band, stroke: style.Stroke) -> None:
+    """Draw each run as a thin line, with a cross where it diverged."""
     for curve in shown.curves:
         dot = "." if len(curve.epochs) == 1 else ""
         axes.plot(
             curve.epochs, curve.values, color=stroke.colour, lw=0.5, alpha=0.45, marker=dot, gid=f"run-{curve.run_id}"
         )
         _draw_end(axes, curve, stroke, shown.upwards)
+
+
+def draw_spread(axes: Axes, shown: Band, stroke: style.Stroke, **line: Any) -> Line2D:
+    """Draw the spread and the centre, and return its line, which has `count_label` as its label."""
     low, high = shown.edges(axes.get_yscale() == "log", axes.get_ylim()[1])
     axes.fill_between(shown.epochs, low, high, color=stroke.colour, alpha=0.22, lw=0)
     drawn = draw_centre(axes, shown, stroke, **line)
@@ -215,9 +225,19 @@ def count_label(shown: Band) -> str:
     return f"{style.literal(shown.label)}: {counted(len(shown.curves), 'run')}{fate}"
 
 
-def legend_title(statistic: Statistic) -> str:
-    """Return a legend title that explains the thick line, the band and the thin lines of `draw_band`."""
-    return f"line and band: {statistic.words}; thin: single runs"
+def in_words(bands: Sequence[Band], statistic: Statistic, runs: bool = True) -> str:
+    """Return the sentence of a caption on what line, band and, with `runs`, thin lines of these groups show."""
+    groups = [f"{len(shown.curves)} of {shown.label}" + _lost(shown) for shown in bands]
+    return f"Line and band: {statistic.words} over all runs ({', '.join(groups)})" + "; thin lines: runs" * runs + "."
+
+
+def _lost(shown: Band) -> str:
+    return f", of which {shown.diverged} diverged" if shown.diverged else ""
+
+
+def legend_title(statistic: Statistic, runs: bool = True) -> str:
+    """Return a legend title that explains the thick line, the band and, with `runs`, the thin lines of `draw_band`."""
+    return f"line and band: {statistic.words}" + "; thin: single runs" * runs
 
 
 def limits(bands: Sequence[Band], others: Sequence[float] = (), ceiling: float = CEILING) -> tuple[float, float]:

@@ -27,6 +27,7 @@ from ssmail.plots.run_groups import (
 )
 from ssmail.store import RunRow, RunState, Store
 
+FIGURE = "forecast"  # draws a chosen selection of the runs on a data set
 OWN = "trajectories"
 ENVIRONMENTS = ("mocap", OWN)
 ERRORS = "test/mse"
@@ -65,9 +66,9 @@ class DataSet:
             if fitting:
                 best = max(fitting, key=lambda family: family.rank)
                 groups.append(Group(method, newest_of_each_seed(best.runs)))
-                notes.append(choice_note(groups[-1], True, [run for run in learned if run.method == method]))
+                notes.append(choice_note(FIGURE, groups[-1], True, [run for run in learned if run.method == method]))
             else:
-                notes.append(f"{method} has no run of profile {profile}; --profile or --runs chooses others.")
+                notes.append(f"{method} has no run of profile {profile}; `ssmail plot {FIGURE} --runs` chooses others.")
         return Selection(tuple(groups), tuple(notes))
 
 

@@ -26,8 +26,8 @@ from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band
 from ssmail.plots.data_sets import DataSet
-from ssmail.plots.formatting import number
-from ssmail.plots.metric_units import label
+from ssmail.plots.formatting import listed, number
+from ssmail.plots.metric_units import UNITS, WORDS, named
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Selection, tested_alike
 from ssmail.store import RunRow, RunState, Store
@@ -66,6 +66,15 @@ class ForecastRecord:
         """Every finite error that is shown."""
         values: Floats = np.concatenate([*(shown.finite for shown in self.bands), *self.references.values()])
         return values[np.isfinite(values)]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        references = f" Black: {listed([*self.references])}." if self.references else ""
+        return (
+            f"Test error of forecasts on {self.data.name} against the predicted step: the {WORDS[self.error]}, in "
+            f"{UNITS[self.error]}. {curves.in_words(self.bands, self.statistic)}{references}"
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, label, run_id, seed, step, value, low, high]; kind: run, mean or median, diverged, reference."""
@@ -146,7 +155,7 @@ def draw(record: ForecastRecord) -> Figure:
         handles = [curves.draw_band(axes, shown, strokes[shown.label]) for shown in record.bands]
         handles += [_draw_reference(axes, name, errors) for name, errors in record.references.items()]
         style.step_axis(axes, record.steps)
-        axes.set_ylabel(label(f"test/{record.error}"))
+        axes.set_ylabel(named(record.error, "test"))
         title = f"{style.literal(record.data.name)}; {curves.legend_title(record.statistic)}"
         figure.legend(handles=handles, loc="outside upper center", ncols=columns, title=title)
         return figure

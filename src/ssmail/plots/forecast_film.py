@@ -41,7 +41,7 @@ def save_film(record: TrajectoriesRecord, outdir: Path) -> Path:
     pictures = [picture.quantize(palette=palette) for picture in pictures]
     each = float(np.clip(SECONDS / len(pictures), SHORTEST, LONGEST))
     times = [each] * (len(pictures) - 1) + [LAST]
-    saving.save_film(pictures, path, [round(1000 * seconds) for seconds in times], record.provenance)
+    saving.save_film(pictures, path, [round(1000 * seconds) for seconds in times], record)
     return path
 
 

@@ -40,6 +40,17 @@ class TrajectoriesRecord:
         """What the legend says of the run."""
         return f"{style.literal(self.run.method)} on {style.literal(name_of(self.run))}, seed {self.run.seed}"
 
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        first = self.windows[0]
+        observed = "the observed past (black), " if len(first.observed) else ""
+        return (
+            f"Forecasts by {self.run.method} on {name_of(self.run)}, seed {self.run.seed}, in "
+            f"{counted(len(self.windows), 'test window')}: {observed}the true future (orange) and "
+            f"{counted(len(first.samples), 'sampled future')} (blue) of every agent."
+        )
+
     def table(self) -> pd.DataFrame:
         """[window, kind, sample, agent, step, x, ...]; kind: observed, true, sampled (others have sample -1)."""
         return pd.concat([rows for window in self.windows for rows in window.rows()], ignore_index=True)

@@ -18,6 +18,7 @@ from PIL import Image
 from ssmail.config.names import flatten
 from ssmail.errors import InputError
 from ssmail.plots import landscape_grids, saving, style
+from ssmail.plots.formatting import listed
 from ssmail.plots.landscape_grids import Landscape
 from ssmail.plots.provenance import Provenance
 from ssmail.store import RunRow, Store
@@ -42,6 +43,16 @@ class LandscapeRecord:
         """The files' name without ending."""
         which = f"_{self.landscapes[0].epoch}" if len(self.landscapes) == 1 else ""
         return f"{self.provenance.figure}_{self.run.name}{which}"
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        epochs = listed([str(landscape.epoch) for landscape in self.landscapes])
+        return (
+            f"The reward that {self.run.method} learned on {self.run.environment} (seed {self.run.seed}), over the "
+            f"plane, after epoch {epochs}: a panel for each agent, with trajectories of the expert (orange) and "
+            "rollouts of the policy of that epoch (blue)."
+        )
 
     def table(self) -> pd.DataFrame:
         """[kind, epoch, agent, trajectory, step, x, y, reward, slope_x, slope_y].
@@ -101,7 +112,7 @@ def save_film(record: LandscapeRecord, outdir: Path) -> Path:
     with style.sheet():
         pictures = [picture.quantize(colors=128) for picture in _film(record)]
     times = [SECONDS] * (len(pictures) - 1) + [LAST]
-    saving.save_film(pictures, path, [round(1000 * seconds) for seconds in times], record.provenance)
+    saving.save_film(pictures, path, [round(1000 * seconds) for seconds in times], record)
     return path
 
 

@@ -19,7 +19,7 @@ MAP = "viridis"
 EXPERT, POLICY = "#D55E00", "#0072B2"  # red and blue of Okabe and Ito, as in the paper's figure
 UNITS = {"letters": "letter heights", "yjunction": "step lengths"}  # by environment, of raw lengths
 FRAMES = 12  # landscapes for a film, as on letters
-LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, of a reward from 0 to 1
+LEVELS = np.linspace(0.1, 0.9, 9)  # of the contour lines, as shares of the limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,13 +116,13 @@ def read(store: Store, run: RunRow, epoch: int) -> Landscape:
     )
 
 
-def normalised(reward: Floats) -> Floats:
-    """Rescale the reward to [0, 1]; a constant reward becomes 0.5."""
-    low, span = reward.min(), np.ptp(reward)
-    return (reward - low) / span if span > 0 else np.full_like(reward, 0.5)
+def standardised(reward: Floats) -> Floats:
+    """Return the reward minus its mean, in standard deviations; a constant reward becomes 0."""
+    spread = reward.std()
+    return (reward - reward.mean()) / spread if spread > 0 else np.zeros_like(reward)
 
 
-def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[float, float] = (0, 1)) -> AxesImage:
+def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[float, float]) -> AxesImage:
     """Draw a reward (H, W) as colors, with contour lines at tenths of the limits."""
     edges = extent(landscape)
     image = axes.imshow(
@@ -130,7 +130,8 @@ def draw_reward(axes: Axes, landscape: Landscape, reward: Floats, limits: tuple[
     )
     levels = limits[0] + LEVELS * (limits[1] - limits[0])
     if np.ptp(reward) > 0:
-        axes.contour(landscape.x, landscape.y, reward, levels=levels, colors="white", linewidths=0.3, alpha=0.7)
+        lines: dict[str, Any] = {"colors": "white", "linewidths": 0.3, "linestyles": "solid", "alpha": 0.7}
+        axes.contour(landscape.x, landscape.y, reward, levels=levels, **lines)
     frame(axes, landscape)
     return image
 

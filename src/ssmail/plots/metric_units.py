@@ -29,6 +29,13 @@ UNITS = {
     "intervention_frequency": "per step",
     "best_epoch": "epochs",
 }
+WORDS = {
+    "mse": "squared error",
+    "mode_mse": "squared error to the nearest lane",
+    "distance": "distance to the true position",
+    "lane_balance": "share of the rarer lane",
+}
+"""What the axes of the figures of the paper, and of forecasts, call a quantity."""
 ERRORS = frozenset({"mse", "mode_mse", "one_step_mse", "ade", "fde", "distance", "energy"})
 
 
@@ -36,6 +43,12 @@ def label(metric: str) -> str:
     """Return the axis label of a metric ("train/mode_mse"): its stored name, with the unit on a second line."""
     unit = UNITS.get(_quantity(metric))
     return f"{metric}\n({unit})" if unit else metric
+
+
+def named(metric: str, split: str) -> str:
+    """Return the name of a metric of WORDS in words, with its unit on a second line: "test squared error\n(...)"."""
+    quantity = _quantity(metric)
+    return f"{split} {WORDS[quantity]}\n({UNITS[quantity]})"
 
 
 def is_error(metric: str) -> bool:

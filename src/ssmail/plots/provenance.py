@@ -1,7 +1,8 @@
 """Where a figure comes from, written into its files and read back: PNG text chunk, PDF information, SVG metadata.
 
 The record is one line of JSON under one key of each format: `ssmail` (PNG), `Keywords` (PDF), `dc:description` (SVG); a
-film (GIF) has it as its comment.
+film (GIF) has it as its comment. The caption is in the record, and where other programs look for one: `Description`
+(PNG), `Subject` (PDF), the title (SVG).
 No date is written, so that equal runs give equal files.
 
 Figures come from anywhere, so nothing in one is believed: its size is bounded, it has to be complete, entities in an
@@ -63,6 +64,7 @@ class Provenance:
     differs: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)  # by spec hash: see spec_differences
     options: Mapping[str, Any] = field(default_factory=dict)  # with which the figure was collected, beside the runs
     csv_sha256: str | None = None  # of the CSV that was written with the figure
+    caption: str = ""  # what the figure shows, in a few sentences
 
     @classmethod
     def of(
@@ -112,10 +114,11 @@ class Provenance:
         """What to pass as `metadata` to `Figure.savefig` for one of FORMATS."""
         title = f"ssmail {self.figure}"
         if format == "png":
-            return {"Title": title, "ssmail": self.as_json()}
+            return {"Title": title, "Description": self.caption, "ssmail": self.as_json()}
         if format == "pdf":
-            return {"Title": title, "Keywords": self.as_json(), "CreationDate": None, "ModDate": None}
-        return {"Title": title, "Description": self.as_json(), "Date": None}
+            described = {"Title": title, "Subject": self.caption, "Keywords": self.as_json()}
+            return {**described, "CreationDate": None, "ModDate": None}
+        return {"Title": f"{title}: {self.caption}", "Description": self.as_json(), "Date": None}
 
 
 def read(path: Path) -> Provenance:

@@ -99,7 +99,8 @@ def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:
     hashes = sorted({run.dataset_hash for run in runs if run.dataset_hash})
     if len(hashes) > 1:
         names = ", ".join(value[:8] for value in hashes)
-        raise InputError(f"{figure} would mix runs on different data ({names}); name runs on one of them with --runs.")
+        remedy = f"name runs on one of them (`ssmail plot {figure} --runs`)"
+        raise InputError(f"{figure} would mix runs on different data ({names}); {remedy}.")
 
 
 def tested_alike(figure: str, runs: Sequence[RunRow]) -> Mapping[str, Any]:
@@ -149,8 +150,8 @@ def fullest_profile(families: Mapping[str, Sequence[Family]]) -> str:
     return max((family.runs[0].profile for found in families.values() for family in found), key=fullness)
 
 
-def choice_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
-    """Say which spec is drawn of a method, and how many other specs and unfinished runs of `stored` are not."""
+def choice_note(figure: str, group: Group, current: bool, stored: Sequence[RunRow]) -> str:
+    """Say which spec `figure` draws of a method, and how many other specs and unfinished runs of `stored` it leaves."""
     first = group.runs[0]
     others = len({run.spec_hash for run in stored if run.state.settled} - {first.spec_hash})
     unfinished = sum(run.spec_hash == first.spec_hash and not run.state.settled for run in stored)
@@ -159,7 +160,7 @@ def choice_note(group: Group, current: bool, stored: Sequence[RunRow]) -> str:
     if not current:
         note += "; not the spec that experiments.yaml gives now"
     if others:
-        note += f"; {counted(others, 'other stored spec')} left out (choose with --runs)"
+        note += f"; {counted(others, 'other stored spec')} left out (`ssmail plot {figure} --runs` chooses)"
     if unfinished:
         note += f"; {counted(unfinished, 'unfinished run')} left out"
     return f"{note}."

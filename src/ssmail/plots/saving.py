@@ -38,13 +38,14 @@ def save_figure(stem: str, record: FigureRecord, figure: Figure, outdir: Path, f
     return [*paths, table]
 
 
-def save_film(pictures: Sequence[Image.Image], path: Path, milliseconds: Sequence[int], provenance: Provenance) -> None:
-    """Write an endless animated GIF, each picture shown for its time, with the provenance as its comment.
+def save_film(pictures: Sequence[Image.Image], path: Path, milliseconds: Sequence[int], record: FigureRecord) -> None:
+    """Write an endless animated GIF, each picture shown for its time, with the record's provenance as its comment.
 
     Creates the folder. Raises InputError when it cannot be written.
     """
     first, *rest = pictures
-    film = {"append_images": rest, "duration": list(milliseconds), "loop": 0, "comment": provenance.as_json()}
+    comment = replace(record.provenance, caption=record.caption).as_json()
+    film = {"append_images": rest, "duration": list(milliseconds), "loop": 0, "comment": comment}
     with _explained(path.parent), atomic_write(path) as partial:
         first.save(partial, format="GIF", save_all=True, **film)
 
@@ -73,5 +74,5 @@ def digest(csv: str) -> str:
 
 
 def embedded(record: FigureRecord, csv: str) -> Provenance:
-    """Return the provenance that is written into the files: the record's, with the hash of its CSV."""
-    return replace(record.provenance, csv_sha256=digest(csv))
+    """Return the provenance that is written into the files: the record's, with its caption and the hash of its CSV."""
+    return replace(record.provenance, caption=record.caption, csv_sha256=digest(csv))

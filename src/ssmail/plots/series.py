@@ -251,7 +251,7 @@ def _default_methods(store: Store, needed: _Comparison, profile: str | None) -> 
         if fitting:
             best = max(fitting, key=lambda family: family.rank)
             groups.append(Group(method, newest_of_each_seed(best.runs)))
-            notes.append(choice_note(groups[-1], best.current, stored[method]))
+            notes.append(choice_note(needed.figure, groups[-1], best.current, stored[method]))
         else:
             missing.append(f"{method} is missing; run {needed.command(method, drawn_profile)}.")
     return Selection(tuple(groups), (*notes, *missing))

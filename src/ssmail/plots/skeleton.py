@@ -23,6 +23,7 @@ from ssmail.data import expert_sets
 from ssmail.data.trajectories import SPLITS, ExpertSet, Floats, Integers, Trajectories
 from ssmail.errors import InputError, printable, unknown_name
 from ssmail.plots import saving, style
+from ssmail.plots.formatting import counted
 from ssmail.plots.provenance import Provenance
 
 NAME = "skeleton"
@@ -70,6 +71,14 @@ class SkeletonRecord:
     def sides(self) -> tuple[str, ...]:
         """Return (N,) keys of SIDES, one for the bone that ends in each joint."""
         return tuple(side(joint, self.joints) for joint in self.joints)
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        return (
+            f"Recorded walking, trial {self.trial}: {counted(len(self.shown), 'pose')} of {len(self.places)} frames "
+            f"({RATE} a second), seen from the right of the walker."
+        )
 
     def table(self) -> pd.DataFrame:
         """[trial, frame, joint, parent, side, along, height], one row for each joint of each pose in the picture."""
@@ -183,7 +192,7 @@ def save_film(record: SkeletonRecord, path: Path) -> None:
     with style.sheet():
         pictures = [picture.quantize(colors=64) for picture in _film(record)]
     times = [round(1000 * STRIDE / (RATE * SPEED))] * len(pictures)
-    saving.save_film(pictures, path, times, record.provenance)
+    saving.save_film(pictures, path, times, record)
 
 
 def _film(record: SkeletonRecord) -> Iterator[Image.Image]:

@@ -1,4 +1,4 @@
-"""How every figure looks: one column wide, print-sized text, colours that colour-blind readers tell apart.
+"""How every figure looks: one column wide (or both), print-sized text, colours that colour-blind readers tell apart.
 
 Colours are those of Okabe and Ito (2008); methods differ by line style too, so that a grey print stays readable.
 """
@@ -16,12 +16,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from ssmail.data.trajectories import Floats
 from ssmail.errors import printable, shortened
 
 COLUMN_WIDTH = 3.4  # inches: one column of a two-column page
+PAGE_WIDTH = 7.0  # inches: both columns
 RESOLUTION = 300  # dots per inch of a PNG
 
 REFERENCE = "#222222"
@@ -104,9 +105,9 @@ def sheet() -> Iterator[None]:
         yield
 
 
-def new_figure(height: float) -> Figure:
-    """Return an empty Figure, one column wide and `height` inches high, on the Agg canvas. Call it within `sheet()`."""
-    figure = Figure(figsize=(COLUMN_WIDTH, height), layout="constrained")
+def new_figure(height: float, width: float = COLUMN_WIDTH) -> Figure:
+    """Return an empty Figure of this size in inches, on the Agg canvas. Call it within `sheet()`."""
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
@@ -121,10 +122,14 @@ def literal(text: str) -> str:
 
 
 def log_axis(axes: Axes, limits: tuple[float, float]) -> None:
-    """Make the y axis logarithmic with these limits. A range of few decades gets a fine grid."""
+    """Make the y axis logarithmic with these limits. A range of few decades gets a fine grid, and plain numbers."""
     axes.set_yscale("log")
     axes.set_ylim(*limits)
-    axes.yaxis.set_major_locator(LogLocator(numticks=8))
+    narrow = limits[1] < 1e2 * limits[0]
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if narrow else (1,), numticks=8))
+    if narrow:
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     if limits[1] < 1e3 * limits[0]:
         axes.grid(which="minor", axis="y", lw=0.2)
     else:

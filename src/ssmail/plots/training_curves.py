@@ -22,7 +22,7 @@ from ssmail.errors import InputError, unknown_name
 from ssmail.evaluation.statistics import Statistic
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, band, silent
-from ssmail.plots.formatting import as_file_name, counted
+from ssmail.plots.formatting import as_file_name, counted, listed
 from ssmail.plots.metric_units import label, last_part
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import Group, by_spec, check_one_data_set, newest_of_each_seed
@@ -61,6 +61,12 @@ class TrainingRecord:
         """The files' name without ending: other metrics, other files."""
         names = "_".join(as_file_name(panel.metric) for panel in self.panels)
         return f"{NAME}_{names}"[:100]
+
+    @property
+    def caption(self) -> str:
+        """See FigureRecord."""
+        metrics = listed([panel.metric for panel in self.panels])
+        return f"{metrics} over epochs. {curves.in_words(self.panels[0].bands, self.statistic)}"
 
     def table(self) -> pd.DataFrame:
         """[metric, kind, label, run_id, seed, epoch, value, low, high]; kind: run, mean or median, diverged."""

@@ -48,6 +48,11 @@ def computed_metrics(
     return found
 
 
+def centre_lines(store: Store, run: RunRow) -> Any:
+    """Return the lanes' centre lines (L, P', 2) of the run's data, in double precision; None where none is stored."""
+    return _Arrays(store).centre_lines(run)
+
+
 def note(computed: Computed) -> str | None:
     """Return one sentence on what was computed, None if nothing was."""
     if not computed.rollouts:

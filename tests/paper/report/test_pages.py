@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from ssmail.config.experiments import build_spec
 from ssmail.errors import InputError
 from ssmail.paper.claims import Verdict
 from ssmail.paper.judgement import judge
 from ssmail.paper.report.contents import gather
-from ssmail.paper.report.drawing import Drawn
+from ssmail.paper.report.drawing import Drawn, draw
 from ssmail.paper.report.pages import html, markdown, write
 from ssmail.store import Store
-from tests.paper.report.conftest import COMMAND, ERRORS, Written
+from tests.paper.report.conftest import COMMAND, ERRORS, Written, add
 from tests.paper.report.page_reader import Page
 
 
@@ -52,6 +53,34 @@ def test_nothing_is_fetched(written: Written) -> None:
 def test_the_figure_is_inside(written: Written) -> None:
     (image,) = (value for name, value in Page(written.html).addresses if name == "src")
     assert base64.b64decode(image.partition(",")[2]) == (written.folder / "figures" / "fig4_stability.png").read_bytes()
+
+
+def test_verdicts_and_figures_come_first_and_figures_have_captions(written: Written) -> None:
+    places = [
+        written.html.index(f'<section id="{name}">') for name in ("verdicts", "figures", "claims", "runs", "about")
+    ]
+    assert places == sorted(places)
+    caption = written.report.figures[0].caption
+    assert caption.startswith("Training error on Y-Junction over epochs")
+    assert caption in Page(written.html).words()
+    assert caption in written.markdown
+    navigation = written.html[written.html.index("<nav>") : written.html.index("</nav>")]
+    assert re.findall(r'href="#(\w+)"', navigation) == [
+        *("verdicts", "figures", "fig4", "fig7", "claims", "runs", "specs", "about")
+    ]
+
+
+def test_notes_advise_no_option_that_report_lacks(store: Store, add_other_specs: None, tmp_path: Path) -> None:
+    drawn = draw("fig4", store, None, tmp_path, ["svg"])
+    told = markdown(gather(store, [drawn], [], "ssmail report"), tmp_path)
+    assert "1 other stored spec left out (\\`ssmail plot fig4 --runs\\` chooses)" in told
+
+
+@pytest.fixture
+def add_other_specs(store: Store) -> None:
+    """Two specs of ssail."""
+    for overrides in ([], ["sac.gamma=0.5"]):
+        add(store, build_spec("ssail", "yjunction", "smoke", overrides), 0, 0.01)
 
 
 def test_verdicts_effects_and_every_seed(written: Written) -> None:

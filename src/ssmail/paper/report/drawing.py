@@ -30,7 +30,7 @@ EMBEDDED_RESOLUTION = 250  # dots per inch of a picture that is only in the repo
 
 @dataclass(frozen=True)
 class Drawn:
-    """A figure with its `files` (the CSV last), `provenance` and `notes`; or else why it `lacks` all of these.
+    """A figure with its `files` (the CSV last), `provenance`, `notes` and `caption`; or else why it `lacks` these.
 
     subject: what a figure of SUMMARIES shows, such as the name of a data set.
     """
@@ -40,6 +40,7 @@ class Drawn:
     figure: "Figure | None" = None
     provenance: Provenance | None = None
     notes: tuple[str, ...] = ()
+    caption: str = ""
     lacks: str = ""
     subject: str = ""
 
@@ -129,4 +130,11 @@ def _saved(
     from ssmail.plots.saving import save_figure
 
     files = save_figure(stem, record, figure, out, formats)
-    return replace(empty, files=tuple(files), figure=figure, provenance=record.provenance, notes=record.notes)
+    return replace(
+        empty,
+        files=tuple(files),
+        figure=figure,
+        provenance=record.provenance,
+        notes=record.notes,
+        caption=record.caption,
+    )
