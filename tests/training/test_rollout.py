@@ -149,3 +149,12 @@ def test_mean_actions_depend_on_the_draw_of_the_graph_alone() -> None:
     for edge_types, deterministic, alike in ((1, True, True), (1, False, False), (2, True, False)):
         made = [acting(OBSERVED, None, seed, edge_types, deterministic=deterministic)[1] for seed in range(4)]
         assert all(torch.equal(other.states, made[0].states) for other in made) is alike
+
+
+def test_several_samples_of_a_group_are_rollouts_of_as_many_copies() -> None:
+    """They share what the policy has observed, and nothing of what is drawn."""
+    _, shared = acting(OBSERVED, None, samples=3)
+    _, copies = acting(OBSERVED.repeat(3, 1, 1, 1), None)
+    torch.testing.assert_close(shared.states, copies.states)
+    torch.testing.assert_close(shared.actions, copies.actions)
+    assert not torch.allclose(shared.actions[:B], shared.actions[B : 2 * B])

@@ -190,3 +190,20 @@ def test_predictions_in_parts_are_those_of_all_at_once(method: str, monkeypatch:
     for whole, parts in zip(*found, strict=True):
         torch.testing.assert_close(parts, whole)
         assert not torch.allclose(whole[:1].expand_as(whole), whole)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("method", ["nri", "dnri"])
+def test_several_samples_of_a_group_are_predictions_of_as_many_copies(method: str, deterministic: bool) -> None:
+    """They share what the encoder has observed, and nothing of what is drawn."""
+    made = learner(method, "variational.decoder=recurrent")
+    observed = made.context.experts.states[:5, :6]
+    with torch.no_grad():  # so that the graph matters
+        for p in made.model.decoder.parameters():
+            p.mul_(3)
+    shared, copies = (
+        made.predictor.free_run(given, 4, torch.Generator().manual_seed(0), deterministic=deterministic, samples=of)
+        for given, of in ((observed, 3), (observed.repeat(3, 1, 1, 1), 1))
+    )
+    torch.testing.assert_close(shared, copies)
+    assert torch.allclose(shared[:5], shared[5:10]) is deterministic

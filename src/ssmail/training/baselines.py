@@ -31,7 +31,7 @@ class ConstantVelocity(Baseline):
         for t in range(steps):
             read = states[-1] if noise is None else states[-1] + noise[:, first + t]
             states.append(self._next(states[-1], read))
-        return torch.stack(states, dim=1)
+        return torch.stack(states, dim=1).repeat(reading.get("samples", 1), 1, 1, 1)
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """See Predictor."""
@@ -49,7 +49,8 @@ class CopyLast(Baseline):
         """See Predictor."""
         last, first, noise = observed[:, -1:], observed.shape[1] - 1, reading.get("noise")
         copies = last.repeat(1, steps, 1, 1)
-        return torch.cat([last, copies if noise is None else copies + noise[:, first : first + 1]], dim=1)
+        states = torch.cat([last, copies if noise is None else copies + noise[:, first : first + 1]], dim=1)
+        return states.repeat(reading.get("samples", 1), 1, 1, 1)
 
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
         """See Predictor."""

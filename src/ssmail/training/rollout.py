@@ -9,8 +9,10 @@ from torch import Tensor
 
 from ssmail.config.sections import ModelSpec
 from ssmail.envs.integrator import Integrator
+from ssmail.models import message_passing
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import Memory
+from ssmail.models.graph_steps import GraphSteps
 from ssmail.models.normalization import ActionBounds
 from ssmail.models.policy import GraphPolicy
 from ssmail.training.batches import Batch
@@ -74,6 +76,7 @@ class PolicyPredictor:
         interventions: Tensor | None = None,
         deterministic: bool = False,
         noise: Tensor | None = None,
+        samples: int = 1,
     ) -> Rollout:
         """Roll the policy out for `steps` actions from the last of the `observed` states (B, H, N, D).
 
@@ -82,9 +85,13 @@ class PolicyPredictor:
         graph is sampled in any case. `noise` (B, H + T - 1, N, D) is added to every state that the policy reads; the
         environment's state stays clean. With the weights of S seeds, all of this has another axis S in front, and
         there is one generator per seed.
+
+        With several `samples` the rollout has S * B trajectories, all groups' first ones first. What the policy
+        observes is then read once for each group, and the graphs of the following steps are inferred by GraphSteps.
         """
         policy, (*lead, h, n, _) = self.model, observed.shape
-        b, a = lead[-1], policy.action_size
+        groups, a = lead[-1], policy.action_size
+        b = groups * samples
         # Draw all noise up front.
         graph_noise = drawn(generator, lambda g: policy.draw_graph_noise(b, steps, n, g)).to(observed.device)
         action_noise = drawn(generator, lambda g: torch.randn(steps, b, 1, n, a, generator=g)).to(observed.device)
@@ -101,6 +108,11 @@ class PolicyPredictor:
             read = observed[..., part, :, :] + noise[..., part, :, :]
             _, memory = policy.encoder(self.features(read, start, first), memory)
         state = observed[..., -1:, :, :]
+        graph_steps = None
+        if samples > 1:
+            state, start = state.repeat(samples, 1, 1, 1), start.repeat(samples, 1, 1)
+            memory = memory and (memory[0].repeat(1, samples, 1), memory[1].repeat(1, samples, 1))
+            graph_steps = GraphSteps(policy.encoder, memory, b, n) if message_passing.FAST else None
         states, actions = [], []
         for t in range(steps):
             # Curriculum: put the group back on the expert's track.
@@ -110,7 +122,11 @@ class PolicyPredictor:
             read = state + noise[..., h - 1 + t : h + t, :, :]
             x = self.features(read, start, h - 1 + t)
             at = t if graph_noise.shape[-4] > 1 else 0
-            graph, _, memory = policy.graphs(x, graph_noise[..., at : at + 1, :, :, :], memory)
+            noise_of_graph = graph_noise[..., at : at + 1, :, :, :]
+            if graph_steps is None:
+                graph, _, memory = policy.graphs(x, noise_of_graph, memory)
+            else:
+                graph = graph_steps.sample(x, noise_of_graph)
             action = policy.actor.sample(x, graph, read[..., a:], action_noise[t])
             states.append(state)
             actions.append(action)

@@ -13,7 +13,7 @@ from ssmail.training.agent_numbers import windows_by_number, with_agents
 from ssmail.training.baselines import Baseline, CopyLast
 from ssmail.training.batches import Arrays, Batch, to_numpy
 from ssmail.training.evaluators import Evaluator, check_frames, input_noise
-from ssmail.training.learner import LearnerContext, Predictor
+from ssmail.training.learner import LearnerContext, Predictor, Reading
 
 PAIRS = 2**16  # pairs of agents whose forecasts are made at once; on a network of the largest profile, some 2 GB
 
@@ -95,11 +95,11 @@ class TrajectoryEvaluator(Evaluator):
         made = 1 if isinstance(predictor, Baseline) and not noisy else samples
         parts, kept, h = [], self._kept().tolist(), self.observed
         for index, states in self._chunks(windows, made):
-            given = states[:, :h].repeat(made, 1, 1, 1)
-            noise = input_noise(self.forecast, given, self.predicted) if noisy else None
-            states_made = predictor.free_run(
-                given, self.predicted, self.generator, deterministic=deterministic, noise=noise
-            )
+            given, reading = states[:, :h], Reading(deterministic=deterministic, samples=made)
+            if noisy:  # every sample has noise of its own on what it observes
+                given = given.repeat(made, 1, 1, 1)
+                reading |= {"samples": 1, "noise": input_noise(self.forecast, given, self.predicted)}
+            states_made = predictor.free_run(given, self.predicted, self.generator, **reading)
             predicted = to_numpy(states_made[:, 1:]).reshape(made, len(index), self.predicted, *states.shape[2:])
             true = to_numpy(states)
             truth = true[:, h : h + self.predicted]

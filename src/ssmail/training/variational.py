@@ -114,21 +114,46 @@ def in_chunks(function: Callable[..., Tensor], chunk: int, *inputs: Tensor) -> T
 
 
 class _GraphSampler:
-    """Samples the graphs of a prediction step by step: nri's single one, or dnri's from the prior and its memory."""
+    """Samples the graphs of a prediction step by step: nri's single one, or dnri's from the prior and its memory.
+
+    gumbel: noise for S samples of each of the B observed groups, the samples of a group one after the other.
+    """
 
     def __init__(self, model: VariationalModel, observed: Tensor, gumbel: Tensor) -> None:
         self.model, self.gumbel, self.step = model, gumbel, 0
+        self.samples = len(gumbel) // len(observed)
         self.memory: Memory | None = None
-        self.fixed = None if model.dynamic else model.sample(model.observed_logits(observed), gumbel)
+        self.fixed: Tensor | None = None
+        if not model.dynamic:
+            self.fixed = model.sample(self._of_samples(model.observed_logits(observed)), gumbel)
 
-    def sample(self, states: Tensor) -> Tensor:
-        """Return the graphs (B, T or 1, N, N, K) under which to decode the next states (B, T, N, D)."""
+    def observe(self, states: Tensor) -> Tensor:
+        """Return the graphs (S * B, T or 1, N, N, K) under which to decode the observed states (B, T, N, D)."""
         if self.fixed is not None:
             return self.fixed
+        logits = self._of_samples(self._prior(states))
+        assert self.memory is not None
+        groups, _, agents, _ = states.shape
+        by_group = (part.unflatten(1, (groups, agents * (agents - 1))) for part in self.memory)
+        hidden, cell = (self._of_samples(part, 1).flatten(1, 2) for part in by_group)
+        self.memory = hidden, cell
+        return self._next(logits)
+
+    def sample(self, states: Tensor) -> Tensor:
+        """Return the graphs (S * B, T or 1, N, N, K) under which to decode the next states (S * B, T, N, D)."""
+        return self._next(self._prior(states)) if self.fixed is None else self.fixed
+
+    def _prior(self, states: Tensor) -> Tensor:
         assert isinstance(self.model.encoder, DynamicEncoder)
         logits, self.memory = self.model.encoder.prior(self.model.read(states), self.memory)
-        first, self.step = self.step, self.step + states.shape[1]
+        return logits
+
+    def _next(self, logits: Tensor) -> Tensor:
+        first, self.step = self.step, self.step + logits.shape[1]
         return self.model.sample(logits, self.gumbel[:, first : self.step])
+
+    def _of_samples(self, of_groups: Tensor, axis: int = 0) -> Tensor:
+        return of_groups.repeat_interleave(self.samples, axis) if self.samples > 1 else of_groups
 
 
 @dataclass(frozen=True)
@@ -157,32 +182,38 @@ class VariationalPredictor:
         dnri draws its graphs from the prior, nri its single graph from the posterior given the observed states. A
         recurrent decoder reads the observed states first.
         """
+        samples = reading.get("samples", 1)
         with evaluation_mode(self.model):
             b, h, n, _ = observed.shape
             noise = reading.get("noise")
             noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
-            gumbel = self.model.draw_noise(b, h - 1 + steps, n, generator).to(observed.device) * (
-                not reading.get("deterministic")
-            )
-            return in_chunks(
-                partial(self._free_run, steps), self._chunk(n), observed, noise.expand(b, -1, -1, -1), gumbel
-            )
+            gumbel = self.model.draw_noise(samples * b, h - 1 + steps, n, generator).to(observed.device)
+            gumbel = gumbel.unflatten(0, (samples, b)).transpose(0, 1)
+            if reading.get("deterministic"):  # so all samples of a group are alike
+                gumbel = 0 * gumbel[:, :1]
+            chunk = max(1, self._chunk(n) // gumbel.shape[1])
+            made = in_chunks(partial(self._free_run, steps), chunk, observed, noise.expand(b, -1, -1, -1), gumbel)
+            return made.expand(-1, samples, -1, -1, -1).transpose(0, 1).flatten(0, 1)
 
     def _free_run(self, steps: int, observed: Tensor, noise: Tensor, gumbel: Tensor) -> Tensor:
-        h = observed.shape[1]
-        graphs = _GraphSampler(self.model, observed + noise[:, :h], gumbel)
+        """Return S futures of each group, (B, S, steps + 1, N, D), for Gumbel noise with the axes (B, S, ...)."""
+        (b, samples), h = gumbel.shape[:2], observed.shape[1]
+        graphs = _GraphSampler(self.model, observed + noise[:, :h], gumbel.flatten(0, 1))
         memory: Tensor | None = None
+        past, state = observed[:, :-1] + noise[:, : h - 1], observed[:, -1:]
         if h > 1:
-            past = observed[:, :-1] + noise[:, : h - 1]
-            _, memory = self.model.decode(past, graphs.sample(past))
-        state = observed[:, -1:]
+            seen = graphs.observe(past)
+        if samples > 1:
+            past, state, noise = (x.repeat_interleave(samples, 0) for x in (past, state, noise))
+        if h > 1:
+            _, memory = self.model.decode(past, seen)
         states = [state]
         for t in range(h - 1, h - 1 + steps):
             read = state + noise[:, t : t + 1]
             action, memory = self.model.decode(read, graphs.sample(read), memory)
             state = self.integrator.step(state, action)
             states.append(state)
-        return torch.cat(states, dim=1)
+        return torch.cat(states, dim=1).unflatten(0, (b, samples))
 
     @torch.no_grad()
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
