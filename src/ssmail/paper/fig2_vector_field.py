@@ -125,7 +125,7 @@ class VectorFieldRecord:
     @property
     def caption(self) -> str:
         """See FigureRecord."""
-        ranges = listed([f"{field.label} (seed {field.run.seed})" for field in self.fields])
+        ranges = listed([f"{field.label} (seed {field.run.seed})" for field in self.fields], "and")
         first = self.fields[0]
         return (
             "The direction of the gradient of an agent's learned reward with respect to its position, at points of "

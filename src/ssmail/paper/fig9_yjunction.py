@@ -44,7 +44,7 @@ class YJunctionRecord:
     @property
     def caption(self) -> str:
         """See FigureRecord."""
-        steps = listed([str(step) for step in self.steps])
+        steps = listed(self.steps, "and")
         return (
             "The Y-Junction: the road with its lanes, and the expert's first training trajectory on each lane, with "
             f"its agents at steps {steps} (filled and open markers tell the lanes apart). The road is drawn twice as "

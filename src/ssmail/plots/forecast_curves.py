@@ -70,7 +70,7 @@ class ForecastRecord:
     @property
     def caption(self) -> str:
         """See FigureRecord."""
-        references = f" Black: {listed([*self.references])}." if self.references else ""
+        references = f" Black: {listed(self.references, 'and')}." if self.references else ""
         return (
             f"Test error of forecasts on {self.data.name} against the predicted step: the {WORDS[self.error]}, in "
             f"{UNITS[self.error]}. {curves.in_words(self.bands, self.statistic)}{references}"

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 
@@ -49,11 +49,6 @@ def short_code(code: str) -> str:
 def counted(count: int, noun: str) -> str:
     """ "1 run", "2 runs"."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def listed(parts: Sequence[str]) -> str:
-    """ "a", "a and b", "a, b and c"."""
-    return " and ".join([", ".join(parts[:-1])] * (len(parts) > 1) + list(parts[-1:]))
 
 
 def spans(numbers: list[int]) -> str:

@@ -47,7 +47,7 @@ class LandscapeRecord:
     @property
     def caption(self) -> str:
         """See FigureRecord."""
-        epochs = listed([str(landscape.epoch) for landscape in self.landscapes])
+        epochs = listed([landscape.epoch for landscape in self.landscapes], "and")
         return (
             f"The reward that {self.run.method} learned on {self.run.environment} (seed {self.run.seed}), over the "
             f"plane, after epoch {epochs}: a panel for each agent, with trajectories of the expert (orange) and "

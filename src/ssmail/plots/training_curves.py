@@ -65,7 +65,7 @@ class TrainingRecord:
     @property
     def caption(self) -> str:
         """See FigureRecord."""
-        metrics = listed([panel.metric for panel in self.panels])
+        metrics = listed([panel.metric for panel in self.panels], "and")
         return f"{metrics} over epochs. {curves.in_words(self.panels[0].bands, self.statistic)}"
 
     def table(self) -> pd.DataFrame:
