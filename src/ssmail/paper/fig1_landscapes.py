@@ -121,8 +121,8 @@ class LandscapesRecord:
         return (
             f"The reward over the plane on {environment}: (a) the task, with trajectories of the expert and rollouts "
             f"of the untrained policy; {listed(['(b) an ideal reward', *learned], 'and')}. Each point shows the reward "
-            "of the agent whose expert comes nearest to it. Rewards have one scale: standard deviations from the mean over "
-            "the plane, with contour lines at every half."
+            "of the agent whose expert comes nearest to it. Rewards have one scale: standard deviations from the mean "
+            "over the plane, with contour lines at every half."
         )
 
     def table(self) -> pd.DataFrame:
