@@ -119,8 +119,10 @@ def test_a_field_or_section_that_is_added_as_null_leaves_the_hash_as_it_was(envi
 
 
 def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
-    """They had the identity without a name for it."""
-    now = build_spec("ssail", "yjunction", "smoke")
+    """They had the identity without a name for it, and what is now an option switched off."""
+    off = ("model.discriminator_waves=[]", "sac.expansion_steps=0", "sac.expansion_start=0", "sac.finite_horizon=false")
+    off += ("sac.average=null", "adversarial.input_noise_final=1", "adversarial.input_noise_start=0")
+    now = build_spec("ssail", "yjunction", "smoke", off)
     values = now.model_dump(mode="json", exclude_none=True)
     assert values["self_supervision"].pop("label") == "identity"
     assert values["model"].pop("initial_scale") == 0.1  # later keys too
