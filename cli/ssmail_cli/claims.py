@@ -148,7 +148,7 @@ def _part_rows(found: "Judgement") -> Iterator[dict[str, Any]]:
 
 def _claim_lines(found: "Judgement") -> list[str]:
     claim = found.claim
-    lines = [f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}"]
+    lines = _wrapped(f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}", 0)
     lines += _wrapped(claim.sentence, 2)
     for part in found.decision.parts:
         lines += _part_lines(part)

@@ -29,7 +29,7 @@ _NAME = re.compile(r"[\w./-]+", re.ASCII)  # what is completed: a shell evaluate
 def take_values_as_they_are() -> None:
     """Let Typer convert no value in this process: it imports pydantic for that, and Tab would have to wait."""
     for kind in (TyperArgument, TyperOption):
-        kind.process_value = lambda _, ctx, value: value  # type: ignore[assignment, method-assign]
+        kind.process_value = lambda _, ctx, value: value  # type: ignore[assignment]
 
 
 def methods() -> list[str]:

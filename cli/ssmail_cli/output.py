@@ -10,6 +10,7 @@ import json
 import math
 import os
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
@@ -172,7 +173,7 @@ def print_table(rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence
     sys.stdout.write(capture.get())
     if len(shown) < len(columns):
         left_out = [heading.replace("\n", " ") for key, heading in columns.items() if key not in shown]
-        say(f"left out, as the terminal is narrow: {', '.join(left_out)}")
+        say(*textwrap.wrap(f"left out, as the terminal is narrow: {', '.join(left_out)}", console.width))
 
 
 def print_document_table(rows: Sequence[Row], columns: Mapping[str, str], form: Format) -> None:

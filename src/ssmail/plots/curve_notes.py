@@ -44,7 +44,8 @@ def compact(store: Store, metric: str, runs: Sequence[RunRow], values: pd.DataFr
     values: the stored ones, a row for each run and step. A metric of the test has no other value anyway.
     """
     steps = {str(run_id): list(own) for run_id, own in values.groupby("run_id")["step"]}
-    single = [run for run in runs if len(steps[run.id]) == 1 < steps[run.id][0] and store.is_compact(run)]
+    of_run = {run.id: steps.get(run.id, []) for run in runs}
+    single = [run for run in runs if len(of_run[run.id]) == 1 < of_run[run.id][0] and store.is_compact(run)]
     if not single or metric.startswith("test"):
         return ()
     return (
