@@ -90,7 +90,7 @@ def _summary(found: "Judgement") -> dict[str, Any]:
     unsettled = "runs missing" if any(part.reason for part in decision.parts) else "no number"
     return {
         "claim": f"{found.claim.name} {found.claim.alias}",
-        "profile": found.settings,
+        "profile": found.profile,
         "verdict": found.verdict.value,
         "p": decision.p,
         "corrected": found.corrected.value,

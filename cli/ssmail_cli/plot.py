@@ -256,6 +256,7 @@ def ablation(
     from ssmail.config.experiments_file import load_experiments
     from ssmail.evaluation.statistics import Statistic
     from ssmail.plots import ablation as figure
+    from ssmail.plots.varied_runs import select
     from ssmail.store.conditions import Condition, matching
 
     named = load_experiments().ablations
@@ -264,7 +265,7 @@ def ablation(
     chosen = _chosen_runs(store, methods, ids=runs, environment=environment, profile=profile)
     chosen = matching(store, chosen, [Condition.parse(text) for text in where or ()])
     with stored_values("these runs"):
-        selection = figure.select(store, chosen, keys, named=bool(runs))
+        selection = select(store, chosen, keys, named=bool(runs))
         shown = metrics or [environment_metrics(selection.runs[0].environment).error]
         record = figure.collect(store, selection, keys, shown, statistic)
         ctx.obj.save("ablation", record.stem, record, figure.draw(record))

@@ -1,15 +1,14 @@
 """`ssmail runs`: list, show, compare, export and delete what the store holds."""
 
 from collections.abc import Iterator, Sequence
-from itertools import chain, groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, printable, unknown_name
+from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.plots.formatting import counted
-from ssmail_cli import completion, options
+from ssmail_cli import comparison_tables, completion, options
 from ssmail_cli.command_group import Commands
 from ssmail_cli.output import (
     Format,
@@ -18,8 +17,6 @@ from ssmail_cli.output import (
     note,
     print_rows,
     print_table,
-    say,
-    short,
     write_csv,
     write_json,
 )
@@ -29,7 +26,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from ssmail.store import RunRow, Store
-    from ssmail.store.comparison import Comparison
 
 
 class RunsGroup(Commands):
@@ -178,7 +174,7 @@ def compare(
         runs = specs_in_order(store, runs, name, descending)
     specs = _limited(list(dict.fromkeys(run.spec_hash for run in runs)), limit, first=name is not None)
     runs = [run for run in runs if run.spec_hash in specs]
-    found = _compared(store, runs, metrics)
+    found = comparison_tables.compared(store, runs, metrics)
     for metric in metrics or ():
         if runs and not any(item.known for item in found if item.metric == metric):
             raise InputError(
@@ -187,15 +183,13 @@ def compare(
     note(*dict.fromkeys(item.computed for item in found if item.computed))
     kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
-        _print_comparisons(found)
+        comparison_tables.print_comparisons(found)
         return
     if kind.of_document:
-        for alike in _by_environment(found):
-            names = ["spec", "seeds", *(item.metric for item in alike[0])]
-            print_rows([_overview_row(group) for group in alike], {name: name for name in names}, kind)
+        comparison_tables.print_overviews(found, kind)
         return
     seeds = sorted({seed for item in found for seed in item.values})
-    print_rows([_comparison_row(item, seeds, kind) for item in found], {}, kind)
+    print_rows([comparison_tables.comparison_row(item, seeds, kind) for item in found], {}, kind)
 
 
 @app.command()
@@ -349,95 +343,3 @@ def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:
         yield {"section": "array", "name": name, "step": None, "value": None}
     for item in details["artifacts"]:
         yield {"section": "artifact", "name": item["name"], "step": None, "value": item["path"]}
-
-
-def _compared(store: "Store", runs: "Sequence[RunRow]", metrics: Sequence[str] | None) -> "list[Comparison]":
-    """Compare the runs of each environment by the given metrics, or by those of the environment."""
-    from ssmail.store.comparison import compare_runs
-
-    return [
-        item
-        for environment in dict.fromkeys(run.environment for run in runs)
-        for item in compare_runs(
-            store,
-            [run for run in runs if run.environment == environment],
-            metrics or list(environment_metrics(environment).compared),
-        )
-    ]
-
-
-def _headings(group: "list[Comparison]") -> dict[str, str]:
-    names = {
-        item.metric: printable(item.metric).replace("_constant_velocity", "\nconstant\nvelocity") for item in group
-    }
-    return {metric: name.replace("/", "/\n") for metric, name in names.items()}
-
-
-def _print_comparisons(found: "list[Comparison]") -> None:
-    """Print a table for each spec, with a row for each seed, mean, std and median and a column for each metric; then a
-    table of the specs of each environment that has several.
-    """
-    for group in chain.from_iterable(_by_environment(found)):
-        first = group[0]
-        rows: list[dict[str, Any]] = [
-            {"seed": str(seed) if state == "finished" else f"{seed} {state}"}
-            | {item.metric: item.values[seed] for item in group}
-            for seed, state in first.states.items()
-        ]
-        for name in ("mean", "std", "median"):
-            rows.append({"seed": name, **{item.metric: getattr(item, name) for item in group}})
-        told = (f", {key}={short(value)}" for key, value in first.differs.items() if key not in first.changes)
-        about = f"{first.method} on {first.environment}, profile {first.settings}, spec {first.spec_hash[:8]}"
-        say(about + "".join(told))
-        print_table(rows, {"seed": "seed", **_headings(group)})
-        say("")
-    between: tuple[str, ...] = ()
-    for alike in _by_environment(found):
-        if len(alike) > 1:
-            environment = alike[0][0].environment
-            say(*between, f"{environment}: mean ± standard deviation; seeds: with the first metric, of all")
-            columns = {"spec": "spec", "seeds": "seeds", **_headings(alike[0])}
-            print_table([_overview_row(group) for group in alike], columns)
-            between = ("",)
-
-
-def _by_environment(found: "list[Comparison]") -> "list[list[list[Comparison]]]":
-    """Return the comparisons by environment, and in it those of each spec together."""
-    specs = [list(metrics) for _, metrics in groupby(found, key=lambda item: item.spec_hash)]
-    return [list(groups) for _, groups in groupby(specs, key=lambda group: group[0].environment)]
-
-
-def _overview_row(group: "list[Comparison]") -> dict[str, Any]:
-    first = group[0]
-    differs = ", ".join(f"{key.rpartition('.')[2]} {short(value)}" for key, value in first.differs.items())
-    spec = f"{first.method} {differs or first.spec_hash[:8]}"
-    seeds = f"{len(first.known)}/{len(first.values)}"
-    return {"spec": spec, "seeds": seeds, **{item.metric: _mean_and_std(item) for item in group}}
-
-
-def _mean_and_std(item: "Comparison") -> str | None:
-    if item.mean is None:
-        return None
-    return f"{item.mean:.3g}" if item.std is None else f"{item.mean:.3g} ± {item.std:.2g}"
-
-
-def _comparison_row(item: "Comparison", seeds: Sequence[int], kind: Format) -> dict[str, Any]:
-    """Return one spec and metric as a row of CSV (with a column for each seed) or JSON."""
-    each = {seed: item.states[seed].value if value is None else value for seed, value in item.values.items()}
-    row = {
-        "method": item.method,
-        "environment": item.environment,
-        "profile": item.profile,
-        "settings": item.settings,
-        "spec_hash": item.spec_hash,
-        "differs": dict(item.differs),
-        "metric": item.metric,
-        "runs": len(item.values),
-        "values": len(item.known),
-        "mean": item.mean,
-        "std": item.std,
-        "median": item.median,
-    }
-    if kind is Format.JSON:
-        return {**row, "seeds": each}
-    return {**row, **{f"seed_{seed}": each.get(seed) for seed in seeds}}

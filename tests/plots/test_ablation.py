@@ -11,8 +11,9 @@ from ssmail.errors import InputError
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.explanation import compare, explain
 from ssmail.plots import NoRuns
-from ssmail.plots.ablation import AblationRecord, collect, draw, select
+from ssmail.plots.ablation import AblationRecord, collect, draw
 from ssmail.plots.saving import save_figure
+from ssmail.plots.varied_runs import select
 from ssmail.store import RunState, Store
 
 GAMMA, BETA, ERROR = "sac.gamma", "curriculum.beta", "test/mode_mse"

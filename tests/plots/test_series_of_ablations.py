@@ -79,8 +79,8 @@ def test_without_it_the_family_with_most_values_times_seeds_is_drawn(store: Stor
     assert chosen(store) == most
     (note,) = select(store, "fig6").notes
     assert note == (
-        "ablation beta: runs of ssail (profile smoke), 2 values, seeds 0, 1; they differ in curriculum.beta alone, but "
-        "are not what experiments.yaml gives now."
+        "ablation beta: runs of ssail (profile smoke + sac.gamma=0.6), 2 values, seeds 0, 1; they differ in "
+        "curriculum.beta alone, but are not what experiments.yaml gives now."
     )
 
 

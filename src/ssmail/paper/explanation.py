@@ -12,7 +12,7 @@ from ssmail.errors import InputError, stored_values
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.csv_comparison import RELATIVE, first_difference
 from ssmail.paper.results import FIGURES
-from ssmail.plots import ablation, forecast_curves, forecast_trajectories, provenance, training_curves
+from ssmail.plots import ablation, forecast_curves, forecast_trajectories, provenance, training_curves, varied_runs
 from ssmail.plots.data_sets import data_sets
 from ssmail.plots.provenance import LARGEST, Provenance, RunSource
 from ssmail.plots.saving import csv_text, digest
@@ -146,13 +146,13 @@ def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
             raise InputError("it does not tell which metrics of which groups it shows")
         runs = store.runs(ids=source.run_ids)
         return training_curves.collect(store, runs, [*map(str, metrics)], group_by, statistic).table()
-    if name == ablation.NAME:
+    if name == varied_runs.NAME:
         given, metrics = options.get("keys"), options.get("metrics")
         if not isinstance(given, list) or not isinstance(metrics, list):
             raise InputError("it does not tell which metrics of which keys it shows")
         runs, keys, names = store.runs(ids=source.run_ids), [*map(str, given)], [*map(str, metrics)]
         with stored_values("its runs"):
-            selection = ablation.select(store, runs, keys, named=True)
+            selection = varied_runs.select(store, runs, keys, named=True)
             return ablation.collect(store, selection, keys, names, statistic).table()
     if name in (forecast_curves.NAME, forecast_trajectories.NAME):
         with stored_values("its runs"):

@@ -7,13 +7,11 @@ colours, and stand beside each other. In an error a diverged run counts as infin
 any other metric its value is unknown, which leaves no centre. The dotted line is constant velocity, where runs stored
 the same metric of it. `curves.calls_for_logarithm` chooses the scale.
 
-The runs drawn are one family: their specs differ in these keys alone. Without named runs it is the family with the most
-values times seeds, the newest on a tie, and of each seed the newest run that finished or diverged.
+`varied_runs.select` chooses the runs.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from textwrap import fill
 from typing import Any, NamedTuple
 
@@ -23,33 +21,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ssmail.config.names import flatten
 from ssmail.data.trajectories import Floats
-from ssmail.errors import InputError, command_line
 from ssmail.evaluation.statistics import Statistic, Summary, summarise
-from ssmail.plots import NoRuns, curves, style
+from ssmail.plots import curves, style
 from ssmail.plots.formatting import as_file_name, counted, setting, spans
 from ssmail.plots.metric_units import is_error, label
 from ssmail.plots.provenance import Provenance
 from ssmail.plots.run_groups import (
-    ABSENT,
     Group,
     Selection,
-    by_spec,
-    check_one_data_set,
-    check_settled,
-    grouped,
-    newest_of_each_seed,
-    rest_of,
     settings_of,
-    value_of,
 )
 from ssmail.plots.training_curves import unknown_metric
+from ssmail.plots.varied_runs import NAME
 from ssmail.store import RunRow, RunState, Store
-from ssmail.store.comparison import known_values, spec_differences
+from ssmail.store.comparison import known_values
 
-NAME = "ablation"
-MOST_KEYS = 2
 WIDTH = 0.84  # of all points above one value, as a share of the distance between two values
 SPREAD = 0.2  # of the points of a column to either side of their middle, as a share of the column
 ASIDE = 0.24  # distance of that middle, and of the centre, from the middle of the column, likewise
@@ -139,21 +126,6 @@ class AblationRecord:
         return pd.DataFrame(rows, columns=["metric", "kind", *self.keys, "run_id", "seed", "value", "low", "high"])
 
 
-def select(store: Store, runs: Sequence[RunRow], keys: Sequence[str], named: bool = False) -> Selection:
-    """Return the fullest family among these runs (newest last), or all of them if they are `named`, by value.
-
-    The value of a group is a tuple, one for each key. Raises NoRuns where no runs differ in the keys alone, InputError
-    for more than two keys, and for named runs that are no family, have not ended, or were trained on different data.
-    """
-    if not 1 <= len(keys) <= MOST_KEYS or len({*keys}) < len(keys):
-        raise InputError(f"{NAME} draws the values of one key or of two; give --key once or twice.")
-    chosen = _checked(runs, keys) if named else _fullest(store, runs, keys)
-    check_one_data_set(NAME, chosen)
-    groups = _groups(chosen, keys, named)
-    drawn = [run for group in groups for run in group.runs]
-    return Selection(tuple(groups), () if named else (_note(drawn, runs, keys),), named)
-
-
 def collect(
     store: Store,
     selection: Selection,
@@ -161,7 +133,10 @@ def collect(
     metrics: Sequence[str],
     statistic: Statistic = Statistic.MEDIAN_IQR,
 ) -> AblationRecord:
-    """Collect the metrics of the runs that `select` chose. Raises InputError for a metric that none of them has."""
+    """Collect the metrics of the runs that `varied_runs.select` chose.
+
+    Raises InputError for a metric that none of the runs has.
+    """
     metrics = tuple(dict.fromkeys(metrics))
     return AblationRecord(
         keys=tuple(keys),
@@ -176,76 +151,6 @@ def collect(
         ),
         notes=selection.notes,
     )
-
-
-def _checked(runs: Sequence[RunRow], keys: Sequence[str]) -> list[RunRow]:
-    """Return the runs. Raises InputError for one that differs from the first in more than the keys."""
-    check_settled(runs, "test results")
-    first = flatten(runs[0].spec)
-    for run in runs:
-        for key in keys:
-            if value_of(run, key) is ABSENT:
-                raise InputError(f"run {run.name} ({run.method}) has no {key}; leave it out.")
-        if rest_of(run, *keys) != rest_of(runs[0], *keys):
-            other = flatten(run.spec)
-            differs = next(key for key in first | other if key not in keys and first.get(key) != other.get(key))
-            told = " and ".join(keys)
-            raise InputError(
-                f"runs {runs[0].name} and {run.name} differ in {differs}, but {NAME} compares runs that differ in "
-                f"{told} alone; leave one of them out."
-            )
-    return list(runs)
-
-
-def _fullest(store: Store, runs: Sequence[RunRow], keys: Sequence[str]) -> list[RunRow]:
-    """Return the runs of the family with the most cells, the newest on a tie. Raises NoRuns without any."""
-
-    def rank(family: Sequence[RunRow]) -> tuple[int, datetime]:
-        return len({(run.spec_hash, run.seed) for run in family}), family[-1].started
-
-    families = _families(runs, keys)
-    if families:
-        return max(families, key=rank)
-    told, words = " and ".join(keys), [f"{key}=V1,V2" for key in keys]
-    others = [key for key in _varied(runs) if key not in keys]
-    hint = f"; others differ in {', '.join(others[:5])}" if others else ""
-    raise NoRuns(
-        f"no runs in {store.where} differ in {told} alone{hint}; train some with "
-        f"`{command_line('ssmail', 'ablate', *words)}`."
-    )
-
-
-def _families(runs: Sequence[RunRow], keys: Sequence[str]) -> list[list[RunRow]]:
-    """Return the settled runs that differ in the keys alone, together; each key has two values or more."""
-    there = [run for run in runs if run.state.settled and all(value_of(run, key) is not ABSENT for key in keys)]
-    found = grouped(there, lambda run: rest_of(run, *keys))
-    return [family for family in found if all(len({value_of(run, key) for run in family}) > 1 for key in keys)]
-
-
-def _varied(runs: Sequence[RunRow]) -> list[str]:
-    """Return the keys in which alone some of the runs differ."""
-    keys = dict.fromkeys(key for differs in spec_differences(runs).values() for key in differs)
-    return [key for key in keys if _families(runs, (key,))]
-
-
-def _groups(runs: Sequence[RunRow], keys: Sequence[str], named: bool) -> list[Group]:
-    """Return a group for each combination of values that is there, in order."""
-    specs = [found if named else newest_of_each_seed(found) for found in by_spec(runs)]
-    found = {
-        tuple(value_of(each[0], key) for key in keys): sorted(each, key=lambda run: (run.seed, run.started))
-        for each in sorted(specs, key=lambda each: min(run.started for run in each))
-    }
-    orders = [_ordered([values[number] for values in found]) for number in range(len(keys))]
-    ranked = sorted(found, key=lambda values: [orders[number].index(value) for number, value in enumerate(values)])
-    return [Group(", ".join(map(setting, values)), tuple(found[values]), values) for values in ranked]
-
-
-def _ordered(values: Sequence[Any]) -> list[Any]:
-    """Return the values, each once: numbers rising, then the others as they come, null last."""
-    distinct = list(dict.fromkeys(values))
-    numbers = sorted(value for value in distinct if isinstance(value, int | float) and not isinstance(value, bool))
-    others = [value for value in distinct if value not in numbers]
-    return [*numbers, *(value for value in others if value is not None), *([None] if None in others else [])]
 
 
 def _panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statistic) -> Panel:
@@ -266,20 +171,6 @@ def _panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statis
     split, _, quantity = metric.partition("/")
     references = store.latest_metrics([run.id for run in runs], [f"{split}_constant_velocity/{quantity}"])["value"]
     return Panel(metric, tuple(columns), float(references.median()) if len(references) else None)
-
-
-def _note(drawn: Sequence[RunRow], runs: Sequence[RunRow], keys: Sequence[str]) -> str:
-    """Say which family is drawn, and how many others there are."""
-    first = drawn[0]
-    others = len(_families(runs, keys)) - 1
-    combinations = counted(len({run.spec_hash for run in drawn}), "value" if len(keys) == 1 else "combination")
-    note = (
-        f"runs of {first.method} on {first.environment} (profile {settings_of(drawn)}), {combinations} of "
-        f"{' and '.join(keys)}, seeds {spans([run.seed for run in drawn])}"
-    )
-    if others:
-        note += f"; {counted(others, 'other set')} of runs left out (choose with --method, --env, --where or --runs)"
-    return f"{note}."
 
 
 def draw(record: AblationRecord) -> Figure:
