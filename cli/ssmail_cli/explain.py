@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ssmail.errors import ExitCode
+from ssmail.errors import ExitCode, shortened
 from ssmail.plots.formatting import short_code
 from ssmail_cli import options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, say, short, write_json
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ssmail.paper.explanation import Agreement, Explanation
 
 NAMED = 3  # runs that a sentence names; the table has all
+LONGEST_CAPTION = 1000  # characters
 COLUMNS = {name: name for name in ("curve", "run", "seed", "state", "spec", "differs", "data", "code", "database")}
 
 
@@ -53,7 +54,7 @@ def _heading(found: "Explanation") -> list[str]:
     source = found.provenance
     about = "".join(f", {name} {short(value)}" for name, value in source.options.items())
     lines = [f"{found.path}: {source.figure}{about}; drawn with ssmail {source.drawn_with}"]
-    lines += [source.caption] if source.caption else []
+    lines += [shortened(source.caption, LONGEST_CAPTION)] if source.caption else []
     lines += [f"code of the runs: {', '.join(source.code)}"] if source.code else []
     lines += [f"data: {', '.join(source.dataset_hashes)}"] if source.dataset_hashes else []
     states = {"as written": "as it was written with the figure", "altered": "altered since", "missing": "missing"}

@@ -45,7 +45,9 @@ def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
     curves = training_curves.collect(store, store.runs(), ["train/mode_mse"])
     save_figure("training", curves, training_curves.draw(curves), folder, ["png"])
     pictures = [Image.new("P", (4, 4), color) for color in (0, 1)]
-    save_film(pictures, folder / "film.gif", [100, 100], replace(record.provenance, figure="film"))
+    save_film(
+        pictures, folder / "film.gif", [100, 100], replace(record, provenance=replace(record.provenance, figure="film"))
+    )
     store.close()
     return folder
 

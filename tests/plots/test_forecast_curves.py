@@ -50,7 +50,7 @@ def test_what_is_drawn_is_what_is_stored(
     np.testing.assert_allclose(lines["copy-last"], 0.004 * STEP)
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["dnri: 1 run", "constant velocity", "copy-last"]
-    assert axes.get_ylabel() == "test/mse\n(squared scaled units)"
+    assert axes.get_ylabel() == "test squared error\n(squared scaled units)"
 
 
 @pytest.mark.parametrize(("level", "scale"), [(0.002, "linear"), (0.0001, "log")])
@@ -82,7 +82,7 @@ def test_the_distance_in_units_of_the_data(store: Store, add_trajectories: AddRu
     assert found.stem == "forecast_flock_distance"
     assert list(found.references) == ["copy-last"]
     (axes,) = draw(found).axes
-    assert axes.get_ylabel() == "test/distance\n(raw units of length)"
+    assert axes.get_ylabel() == "test distance to the true position\n(raw units of length)"
     np.testing.assert_allclose(found.bands[0].summary.centre, 2 * STEP)
     with pytest.raises(InputError, match="unknown error 'dist'; did you mean distance"):
         record(store, error="dist")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
-from ssmail.config.spec import flatten
+from ssmail.config.names import flatten
 from ssmail.errors import InputError, command_line
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted, setting, spans
