@@ -298,6 +298,8 @@ class EvaluationSpec(Frozen):
     # trajectories: validation windows that judge an epoch, evenly over the split (null: all), and forecasts of each
     validation_windows: Count | None
     validation_samples: Count | None
+    # trajectories: test windows of the final evaluation, evenly over the split, the same for all runs; null: all
+    test_windows: Count | None
     # model selection prefers epochs whose validation lane_balance is at least this
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
     # reward landscapes to store, evenly over the epochs, in addition to those of the untrained and of the current model
