@@ -1,13 +1,15 @@
 """`ssmail forecast` and `ssmail export-model`: use the trained model of a run."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ssmail.errors import InputError, shortened
 from ssmail_cli import options
 from ssmail_cli.output import note, say, write_json
+
+if TYPE_CHECKING:
+    from ssmail.inference.trained_run import Model
 
 ModelOption = Annotated[
     str, typer.Option("--model", help="best: with the smallest validation error; last: of the last epoch.")
@@ -58,7 +60,7 @@ def forecast(
     from ssmail.inference.windows import read_windows
 
     forecasts.check_output(out, force=force)
-    trained = load_from(options.open_store(db), run, model=_model(model), data=expert_set)
+    trained = load_from(options.open_store(db), run, model=cast("Model", model), data=expert_set)
     windows = read_windows(data, trained, observed)
     found = forecasts.forecast(trained, windows, steps, samples, seed)
     rows = forecasts.write(found, out, force=force)
@@ -96,15 +98,9 @@ def export_model(
     from ssmail.inference.model_export import export
     from ssmail.inference.trained_run import load_from
 
-    trained = load_from(options.open_store(db), run, model=_model(model), data=expert_set)
+    trained = load_from(options.open_store(db), run, model=cast("Model", model), data=expert_set)
     files = export(trained, out, agents=agents, batch=batch, onnx=onnx, force=force)
     if as_json:
         write_json({"path": out, "run": trained.id, "model": trained.model, "files": files}, None)
     else:
         say(f"wrote {out}: {', '.join(files)}")
-
-
-def _model(name: str) -> Any:
-    if name not in ("best", "last"):
-        raise InputError(f"--model is best or last, not '{shortened(name, 40)}'.")
-    return name

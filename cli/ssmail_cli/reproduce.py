@@ -14,7 +14,7 @@ from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import completion, options
 from ssmail_cli.datasets import prep_mocap
-from ssmail_cli.options import is_missing, parse_seeds
+from ssmail_cli.options import is_missing, noting_damage, parse_seeds
 from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
@@ -215,7 +215,7 @@ def _train(
     for path in sorted({path for name in data.made for path, _ in _absent_files(figures[name])}):
         with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
             prep_mocap(source=cmu, out=Path(path))
-    store = Store.open(db)
+    store = noting_damage(Store.open(db))
     wait_for_others(store, sweep, on_wait)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
     if is_interrupted(rows):

@@ -14,6 +14,7 @@ from ssmail_cli.reproduce import figure_cells
 from tests.cli.command_line import CommandLine, FakeTraining, Outcome
 from tests.data.mocap.handmade import write_subject
 from tests.paper.handmade_arrays import forecasts
+from tests.store.databases import change
 
 SMOKE = ("reproduce", "--profile", "smoke", "--device", "cpu", "--seeds", "0-1")
 LEFT_OUT = (
@@ -101,6 +102,18 @@ def test_figures_are_drawn_from_their_runs_alone(
     assert given["jobs"] == 2
     assert set(provenance.read(out / "fig4_stability.png").run_ids) == {run.id for run in Store.open(db).runs()[-2:]}
     assert outcome.err.startswith("ssail, seed 0: started (run ")
+
+
+def test_damaged_rows_are_noted(
+    cli: CommandLine, fake: FakeTraining, db: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs(monkeypatch, tmp_path, fig9=["ssail"])
+    fake()
+    cli("train", "--profile", "smoke", "--seeds", "7", "--db", db)
+    change(db, "UPDATE run SET state = 'paused' WHERE seed = 7")
+    outcome = cli(*SMOKE, "--out", tmp_path / "figures", "--db", db)
+    (remark,) = (line for line in outcome.err.splitlines() if "damaged row " in line)
+    assert remark == f"1 damaged row left out; `ssmail db check --db {db}` says what is wrong"
 
 
 def test_a_statistic_can_be_chosen_for_the_figures_that_have_one(

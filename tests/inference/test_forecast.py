@@ -147,7 +147,7 @@ def test_what_cannot_be_forecast_is_one_sentence(
     for more, said in (
         (["--observed", "1", "--out", str(out)], "2 to 4 of them can be observed, not 1"),
         (["--out", str(tmp_path / "futures.xlsx")], "unknown ending of --out '.xlsx'"),
-        (["--model", "worst", "--out", str(out)], "--model is best or last"),
+        (["--model", "worst", "--out", str(out)], "a run has a best and a last model, not 'worst'"),
         (["--samples", "10000", "--steps", "100000", "--out", str(out)], "do not fit into memory"),
     ):
         assert command([*arguments, *more]) == 2

@@ -65,6 +65,20 @@ def test_every_curriculum_moves_groups_of_their_own_number(make: Make, curriculu
         assert loop.run_epoch()["curriculum/intervention_frequency"] > 0
 
 
+def test_the_test_may_be_bounded_to_windows_evenly_over_the_split(make: Make) -> None:
+    """The test errors of constant velocity are those of these windows, and these are kept."""
+    specs = make("constant-velocity", "evaluation.test_windows=3"), make("constant-velocity")
+    assert specs[0].hash() != specs[1].hash()
+    bounded, whole = (TrainingLoop(spec, 0) for spec in specs)
+    test = whole.data.test
+    chosen = np.linspace(0, len(test) - 1, 3).round().astype(int)
+    assert isinstance(bounded.evaluator, TrajectoryEvaluator)
+    np.testing.assert_array_equal(bounded.evaluator.test.positions, test.positions[chosen])
+    (values, arrays), (all_values, _) = (loop.final_evaluation() for loop in (bounded, whole))
+    assert values["test/fde"] != pytest.approx(all_values["test/fde"])
+    np.testing.assert_allclose(arrays["test/future"], test.positions[chosen, 4:], rtol=1e-6)
+
+
 def test_the_kept_windows_are_those_of_the_set(make: Make) -> None:
     loop = trained(make("dnri"))
     assert isinstance(loop.evaluator, TrajectoryEvaluator)

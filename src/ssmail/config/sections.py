@@ -292,6 +292,8 @@ class EvaluationSpec(Frozen):
     """trajectories: validation windows that judge an epoch, evenly over the split; null: all."""
     validation_samples: Annotated[Count, Unit("forecasts")] | None
     """trajectories: forecasts of each validation window; null: one."""
+    test_windows: Annotated[Count, Unit("windows")] | None
+    """trajectories: test windows of the final evaluation, evenly over the split, the same for all runs; null: all."""
     least_balance: Annotated[float, Field(ge=0, le=0.5)]
     """Model selection prefers epochs whose validation lane_balance is at least this."""
     landscapes: Count | None

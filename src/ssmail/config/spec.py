@@ -60,7 +60,7 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
     *((section, "centre_relative", False) for section in ("model", "variational")),
     *(("forecast", key, None) for key in ("miss_distance", "collision_distance")),
-    *(("evaluation", key, None) for key in ("validation_windows", "validation_samples")),
+    *(("evaluation", key, None) for key in ("validation_windows", "validation_samples", "test_windows")),
 )
 ARGUMENTS = ("method", "environment", "profile")  # arguments of build_spec, which no mapping may set
 

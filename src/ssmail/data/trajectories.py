@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ssmail.config.data_sections import LettersSpec, YJunctionSpec
 from ssmail.data.scaling import Scaling, ends
+from ssmail.errors import InputError
 
 Floats = NDArray[np.float64]  # arrays of any shape; the docstrings give the axes
 Integers = NDArray[np.int64]
@@ -158,6 +159,15 @@ class ExpertSet:
         scaled = [scaling.scale_positions(end) for pair in positions for end in pair]
         scaled += [scaling.scale_velocities(end) for pair in velocities for end in pair]
         return all(abs(value) <= LARGEST_SCALED for value in scaled)
+
+    def check_scaling(self, source: str, remedy: str) -> None:
+        """Raise InputError, with the remedy, if the numbers from this source cannot be scaled."""
+        try:
+            _ = self.scaling
+        except ValueError:
+            raise InputError(f"nothing moves in the training windows of {source}; {remedy}") from None
+        if not self.is_scalable:
+            raise InputError(f"the positions in {source} differ too much in size to be scaled alike; {remedy}")
 
 
 def generate_splits(

@@ -34,6 +34,7 @@ class TrajectoryEvaluator(Evaluator):
         self.observed, self.predicted = check_frames(self.forecast, data)
         super().__init__(context, data)
         self.validation = data.validation[_evenly(len(data.validation), self.spec.validation_windows)]
+        self.test = data.test[_evenly(len(data.test), self.spec.test_windows)]
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """Forecast validation windows evaluation.validation_samples times, and some training windows once.
@@ -71,7 +72,7 @@ class TrajectoryEvaluator(Evaluator):
         arrays = self._kept_truth()
         for prefix, predictor, deterministic, noise in candidates:
             keep = arrays["test/samples"] if prefix == "test" else None
-            measured, curves = self._measured(predictor, self.data.test, self.spec.samples, deterministic, noise, keep)
+            measured, curves = self._measured(predictor, self.test, self.spec.samples, deterministic, noise, keep)
             values |= {f"{prefix}/{name}": value for name, value in measured.items()}
             arrays |= {f"{prefix}/{name}": curve for name, curve in curves.items()}
         for prefix, predictor in {"test": best, "test_constant_velocity": self.constant_velocity}.items():
@@ -127,27 +128,27 @@ class TrajectoryEvaluator(Evaluator):
     def _one_step_mse(self, predictor: Predictor) -> float:
         """Return the mean squared error of one-step predictions of the test windows, in scaled units."""
         total = 0.0
-        for index, states in self._chunks(self.data.test, self.data.test.positions.shape[1]):
+        for index, states in self._chunks(self.test, self.test.positions.shape[1]):
             total += len(index) * self.one_step(predictor, states)
-        return total / len(self.data.test)
+        return total / len(self.test)
 
     def _expert_values(self) -> dict[str, float]:
         """Return what the true futures of the test windows have in common with forecasts: their collisions."""
         if self.forecast.collision_distance is None:
             return {}
         h, shares = self.observed, []
-        for _, states in self._chunks(self.data.test, 1):
+        for _, states in self._chunks(self.test, 1):
             truth = to_numpy(states)
             future, last = truth[:, h : h + self.predicted], truth[:, h - 1]
             shares.append(measure(future[None], future, last, self.scaling, self.forecast, 1).windows["collisions"])
         return {"test_expert/collisions": float(np.concatenate(shares).mean())}
 
     def _kept(self) -> Integers:
-        return _evenly(len(self.data.test), self.KEPT_WINDOWS)
+        return _evenly(len(self.test), self.KEPT_WINDOWS)
 
     def _kept_truth(self) -> Arrays:
         """Return the arrays of the kept test windows, in raw units; their samples are still to be made."""
-        test, h = self.data.test[self._kept()], self.observed
+        test, h = self.test[self._kept()], self.observed
         positions = test.positions[:, : h + self.predicted].astype(np.float32)
         agents = np.full(len(test), positions.shape[2]) if test.agents is None else test.agents
         return {

@@ -110,7 +110,7 @@ def test_too_short_and_motionless_trials(folder: Path) -> None:
     still = {"root": STILL, "spine": (0, 0, 0), "lleg": (0, 0), "lfoot": (0,)}
     for trial in (1, 2):
         (folder / f"35_{trial:02d}.amc").write_bytes(amc(*[still] * 9))
-    with pytest.raises(InputError, match="nothing moves in the training trials"):
+    with pytest.raises(InputError, match="nothing moves in the training windows"):
         prepare(folder, WANTED)
 
 

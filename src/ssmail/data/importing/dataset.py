@@ -100,7 +100,7 @@ def set_of_rows(
         splits[split] = _trajectories(part, agents, numbers[begin : begin + len(part)])
         begin += len(part)
     experts = recorded_set(splits, scenes, params, digests)
-    _check_scaling(experts, label)
+    experts.check_scaling(label, "are these the right columns, and all in the same unit?")
     return experts, summarize(rows, tracks, repairs, parts, params)
 
 
@@ -162,12 +162,3 @@ def _trajectories(part: Windows, agents: int, scene: Integers) -> Trajectories:
     tracks = part.tracks
     frame = tracks.first[part.scene] + (part.begin + 1) * tracks.step[part.scene]
     return windows(part.positions(agents), part.agents, scene, frame)
-
-
-def _check_scaling(experts: ExpertSet, label: str) -> None:
-    try:
-        _ = experts.scaling
-    except ValueError:
-        raise InputError(f"nothing moves in the training windows of {label}; are these the right columns?") from None
-    if not experts.is_scalable:
-        raise InputError(f"the positions in {label} differ too much in size to be scaled alike; leave the largest out")

@@ -103,12 +103,7 @@ def prepare(source: Path, wanted: MocapParameters, *, allow_missing: bool = Fals
     experts = ExpertSet.bundle(
         splits, NO_LINES, made.model_dump(mode="json"), skeleton.joints, skeleton.parents, sources
     )
-    try:
-        _ = experts.scaling
-    except ValueError:
-        raise InputError(f"nothing moves in the training trials of {source}; {AGAIN}") from None
-    if not experts.is_scalable:
-        raise InputError(f"the trials in {source} differ too much in size to be scaled alike; {AGAIN}")
+    experts.check_scaling(str(source), AGAIN)
     return experts
 
 
