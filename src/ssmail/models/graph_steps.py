@@ -5,6 +5,8 @@ number of an edge is then a long row: all gates of the LSTM are one product and 
 gathered or copied. That takes less than half the time. Read this module for speed only; a test compares the two.
 """
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -20,15 +22,17 @@ class GraphSteps:
 
     def __init__(self, encoder: GraphEncoder, memory: Memory | None, batch: int, agents: int) -> None:
         self.encoder, self.batch, self.agents = encoder, batch, agents
-        lstm, h = encoder.lstm, encoder.lstm.hidden_size
+        h = encoder.lstm.hidden_size
+        weights: Sequence[Tensor] = encoder.lstm.all_weights[0]
+        weight_ih, weight_hh, bias_ih, bias_hh = weights
         # The candidate's tanh(x) is 2 s(2 x) - 1 with the logistic function s of the three gates.
-        scale = torch.ones_like(lstm.bias_ih_l0)
+        scale = torch.ones_like(bias_ih)
         scale[2 * h : 3 * h] = 2
-        self.weight = scale.unsqueeze(1) * torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
-        self.bias = scale * (lstm.bias_ih_l0 + lstm.bias_hh_l0)
+        self.weight = scale.unsqueeze(1) * torch.cat([weight_ih, weight_hh], dim=1)
+        self.bias = scale * (bias_ih + bias_hh)
         pairs = batch * agents**2
-        self.read = lstm.weight_ih_l0.new_zeros(2 * h, pairs)  # the edges, and below them the LSTM's hidden state
-        self.cell = lstm.weight_ih_l0.new_zeros(h, pairs)
+        self.read = weight_ih.new_zeros(2 * h, pairs)  # the edges, and below them the LSTM's hidden state
+        self.cell = weight_ih.new_zeros(h, pairs)
         if memory is not None:
             self.read[h:], self.cell = (self._of_pairs(part) for part in memory)
 

@@ -134,7 +134,7 @@ class _GraphSampler:
         logits = self._of_samples(self._prior(states))
         assert self.memory is not None
         groups, _, agents, _ = states.shape
-        by_group = (part.unflatten(1, (groups, agents * (agents - 1))) for part in self.memory)
+        by_group = (part.view(len(part), groups, agents * (agents - 1), -1) for part in self.memory)
         hidden, cell = (self._of_samples(part, 1).flatten(1, 2) for part in by_group)
         self.memory = hidden, cell
         return self._next(logits)
@@ -188,7 +188,7 @@ class VariationalPredictor:
             noise = reading.get("noise")
             noise = observed.new_zeros(1, h + steps - 1, 1, 1) if noise is None else noise
             gumbel = self.model.draw_noise(samples * b, h - 1 + steps, n, generator).to(observed.device)
-            gumbel = gumbel.unflatten(0, (samples, b)).transpose(0, 1)
+            gumbel = gumbel.view(samples, b, *gumbel.shape[1:]).transpose(0, 1)
             if reading.get("deterministic"):  # so all samples of a group are alike
                 gumbel = 0 * gumbel[:, :1]
             chunk = max(1, self._chunk(n) // gumbel.shape[1])
@@ -213,7 +213,7 @@ class VariationalPredictor:
             action, memory = self.model.decode(read, graphs.sample(read), memory)
             state = self.integrator.step(state, action)
             states.append(state)
-        return torch.cat(states, dim=1).unflatten(0, (b, samples))
+        return torch.cat(states, dim=1).view(b, samples, steps + 1, *state.shape[2:])
 
     @torch.no_grad()
     def one_step(self, states: Tensor, generator: torch.Generator) -> Tensor:
