@@ -186,7 +186,10 @@ def _panel(store: Store, run: RunRow, label: str, expert: Floats, lines: Floats 
     rollouts = shown_rollouts(store.array(run.id, ROLLOUTS))[0]
     predicted = rollouts[:, 1:].astype(np.float64)
     stays = None if lines is None else stays_on_path(path_distances(predicted, lines))
-    return Panel(label, run.id, run.seed, rollouts, stays, nearest_mode(predicted, expert[:, :, 1:]))
+    if LANES in store.array_names(run.id):  # a compact database keeps them once
+        expert = shown_lanes(store.array(run.id, LANES))
+    lanes = nearest_mode(predicted, expert[:, :, 1:]) if expert.shape[1:] == rollouts.shape else None
+    return Panel(label, run.id, run.seed, rollouts, stays, lanes)
 
 
 def _notes(store: Store, selection: Selection) -> list[str]:
