@@ -62,9 +62,24 @@ def ablations() -> list[str]:
     return _of_experiments(lambda experiments: experiments.ablations)
 
 
+def keys() -> list[str]:
+    """Return the keys of the spec: ["data.path", ...]."""
+    return _of_experiments(lambda experiments: flatten(experiments.defaults))
+
+
 def settings() -> list[str]:
     """Return the keys of the spec, as --set takes them: ["data.path=", ...]."""
-    return [f"{key}=" for key in _of_experiments(lambda experiments: flatten(experiments.defaults))]
+    return [f"{key}=" for key in keys()]
+
+
+def varied() -> list[str]:
+    """Return what `ssmail ablate` can vary: the ablations of experiments.yaml, and the keys of the spec."""
+    return [*ablations(), *keys()]
+
+
+def columns(ctx: typer.Context) -> list[str]:
+    """Return what runs can be ordered by: the stored metrics, and the keys of the spec."""
+    return [*metrics(ctx), *keys()]
 
 
 def run_ids(ctx: typer.Context, incomplete: str) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ssmail.errors import InputError, printable, shortened
-from ssmail_cli import options
+from ssmail_cli import completion, options
 from ssmail_cli.output import Format, chosen_format, note, print_rows, say, write_json
 
 app = typer.Typer(help="Show the settings of a run and what they mean, or write your own.", rich_markup_mode=None)
@@ -19,15 +19,19 @@ SHOWN = {"key": "key", "value": "value", "layer": "from"}
 REFERENCE = {name: name for name in ("key", "type", "unit", "range", "default", "meaning")}
 Keys = Annotated[
     list[str] | None,
-    typer.Argument(metavar="[KEY]...", help="Sections or keys, such as sac or sac.gamma; default all."),
+    typer.Argument(
+        metavar="[KEY]...",
+        help="Sections or keys, such as sac or sac.gamma; default all.",
+        autocompletion=completion.keys,
+    ),
 ]
 
 
 @app.command()
 def show(
     keys: Keys = None,
-    method: Annotated[str, typer.Option("--method", help="The method to train.")] = "ssail",
-    environment: Annotated[str, typer.Option("--env", help="The environment to train on.")] = "yjunction",
+    method: options.SpecMethod = "ssail",
+    environment: options.SpecEnvironment = "yjunction",
     profile: options.TrainingProfile = "quick",
     settings: options.Settings = None,
     as_json: options.Json = False,

@@ -99,6 +99,16 @@ Environment = Annotated[
         autocompletion=completion.environments,
     ),
 ]
+SpecMethod = Annotated[
+    str,
+    typer.Option("--method", metavar="METHOD", help=f"The method: {METHOD_NAMES}.", autocompletion=completion.methods),
+]
+SpecEnvironment = Annotated[
+    str,
+    typer.Option(
+        "--env", metavar="ENV", help=f"The environment: {ENVIRONMENT_NAMES}.", autocompletion=completion.environments
+    ),
+]
 Profile = Annotated[
     str | None,
     typer.Option(
@@ -144,11 +154,17 @@ Where = Annotated[
         metavar="CONDITION",
         help="Only runs that meet this condition on a key of the spec, a metric or a column, such as sac.gamma=0.9, "
         "test/mode_mse<0.003 or seed!=0; repeatable, in quotes.",
+        autocompletion=completion.settings,
     ),
 ]
 Sort = Annotated[
     str | None,
-    typer.Option("--sort", metavar="[-]NAME", help="Order by this key, metric or column; -NAME is from high to low."),
+    typer.Option(
+        "--sort",
+        metavar="[-]NAME",
+        help="Order by this key, metric or column; -NAME is from high to low.",
+        autocompletion=completion.columns,
+    ),
 ]
 Descending = Annotated[bool, typer.Option("--descending", help="With --sort, from high to low.")]
 

@@ -227,11 +227,22 @@ def ablation(
     ctx: typer.Context,
     keys: Annotated[
         list[str],
-        typer.Option("--key", help="The key that varies, or the name of an ablation; a second one becomes colours."),
+        typer.Option(
+            "--key",
+            metavar="KEY",
+            help="The key that varies, or the name of an ablation; a second one becomes colours.",
+            autocompletion=completion.varied,
+        ),
     ],
     metrics: Annotated[
         list[str] | None,
-        typer.Option("--metric", help="Draw this metric; repeatable.", show_default="the test error"),
+        typer.Option(
+            "--metric",
+            metavar="METRIC",
+            help="Draw this metric; repeatable.",
+            show_default="the test error",
+            autocompletion=completion.metrics,
+        ),
     ] = None,
     methods: Methods = None,
     environment: options.Environment = None,

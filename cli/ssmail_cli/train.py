@@ -90,7 +90,7 @@ def ablate(
             metavar="NAME|KEY...",
             help="What varies: alpha, beta, curriculum, label or an ablation of your experiments.yaml, or any key of "
             "the spec (`ssmail config keys`); several make a grid.",
-            autocompletion=completion.ablations,
+            autocompletion=completion.varied,
         ),
     ],
     values: Annotated[
