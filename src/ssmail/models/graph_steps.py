@@ -20,15 +20,16 @@ class GraphSteps:
 
     def __init__(self, encoder: GraphEncoder, memory: Memory | None, batch: int, agents: int) -> None:
         self.encoder, self.batch, self.agents = encoder, batch, agents
-        lstm, h = encoder.lstm, encoder.lstm.hidden_size
+        h = encoder.lstm.hidden_size
+        of_input, of_hidden, input_bias, hidden_bias = encoder.lstm.all_weights[0]
         # The candidate's tanh(x) is 2 s(2 x) - 1 with the logistic function s of the three gates.
-        scale = torch.ones_like(lstm.bias_ih_l0)
+        scale = torch.ones_like(input_bias)
         scale[2 * h : 3 * h] = 2
-        self.weight = scale.unsqueeze(1) * torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
-        self.bias = scale * (lstm.bias_ih_l0 + lstm.bias_hh_l0)
+        self.weight = scale.unsqueeze(1) * torch.cat([of_input, of_hidden], dim=1)
+        self.bias = scale * (input_bias + hidden_bias)
         pairs = batch * agents**2
-        self.read = lstm.weight_ih_l0.new_zeros(2 * h, pairs)  # the edges, and below them the LSTM's hidden state
-        self.cell = lstm.weight_ih_l0.new_zeros(h, pairs)
+        self.read = of_input.new_zeros(2 * h, pairs)  # the edges, and below them the LSTM's hidden state
+        self.cell = of_input.new_zeros(h, pairs)
         if memory is not None:
             self.read[h:], self.cell = (self._of_pairs(part) for part in memory)
 
