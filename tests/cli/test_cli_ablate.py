@@ -134,7 +134,8 @@ def test_ranges_are_shown_as_they_are_written(cli: CommandLine, fake: FakeTraini
     outcome = cli("ablate", "alpha", *ranges, *options)
     assert outcome.code == 0
     assert [row["alpha"] for row in outcome.rows] == ["[0, 1]", "[-1, 1]", "[[-1, 0, 1], [0, 1.5, 3]]"]
-    assert outcome.err.startswith("alpha [0, 1], seed 0: started (run ")
+    assert outcome.err.splitlines()[1] == "  alpha [0, 1]: 1 run"
+    assert "\nalpha [0, 1], seed 0: started (run " in outcome.err
 
 
 def test_another_environment(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
@@ -230,11 +231,16 @@ def test_an_ablation_of_ones_own(cli: CommandLine, tmp_path: Path, db: Path, mon
 
 def test_progress_says_which_value_and_which_seed(cli: CommandLine, fake: FakeTraining, db: Path) -> None:
     fake()
-    few = cli(*SMOKE, "--values", "0.1,0.2", "--seeds", "0-1", "--db", db).err.splitlines()
+
+    def told(values: str, seeds: str) -> list[str]:
+        lines = cli(*SMOKE, "--values", values, "--seeds", seeds, "--db", db).err.splitlines()
+        return [line for line in lines if line.startswith("beta ")]
+
+    few = told("0.1,0.2", "0-1")
     assert few[0].startswith("beta 0.1, seed 0: started (run ")
     assert few[1] == "beta 0.1, seed 0: epoch 1/3  val 0.1  critic 0.5"
     assert few[-1].startswith("beta 0.2, seed 1: finished (run ")
-    many = cli(*SMOKE, "--values", "0.3,0.4", "--seeds", f"0-{FEW // 2}", "--db", db).err.splitlines()
+    many = told("0.3,0.4", f"0-{FEW // 2}")
     assert len(many) == 2 * 2 * (FEW // 2 + 1)  # a line for the start and one for the end of each run
     assert many[-1].endswith(f"[{FEW + 2}/{FEW + 2}]")
 

@@ -42,7 +42,7 @@ def complete(line: str) -> list[str]:
         ("ssmail runs list --where sac.gam", ["sac.gamma="]),
         ("ssmail runs list --sort sac.gam", ["sac.gamma"]),
         ("ssmail plot fig4 fig5 --prof", ["--profile"]),
-        ("ssmail plot st", ["stability"]),
+        ("ssmail plot fig9", ["fig9"]),
         ("ssmail reproduce mod", ["modes"]),
         ("ssmail claims C8", ["C8"]),
         ("ssmail runs list --state fi", ["finished"]),

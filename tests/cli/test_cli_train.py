@@ -231,7 +231,9 @@ def test_a_dry_run_tells_what_would_run_and_makes_nothing(cli: CommandLine, fake
 
 @pytest.mark.parametrize("options", [[], ["--dry-run"]])
 def test_nothing_to_resume(cli: CommandLine, db: Path, options: list[str]) -> None:
-    assert "--resume auto" in cli(*SMOKE, "--resume", "require", "--db", db, *options).sentence
+    refused = cli(*SMOKE, "--resume", "require", "--db", db, *options)
+    assert "--resume auto" in refused.err.splitlines()[-1]
+    assert refused.code == 2
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a GPU")

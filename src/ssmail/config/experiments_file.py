@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ssmail.config import strict_yaml
-from ssmail.config.shaping import FUNCTION
+from ssmail.config.names import FUNCTION
 from ssmail.errors import InputError, shortened, suggestion, unknown_name
 
 LAYERS = (

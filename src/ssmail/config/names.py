@@ -1,5 +1,8 @@
-"""The names of methods and environments, and keys with dots, for those who need no spec: importing this is quick."""
+"""The names of methods, environments and functions, and keys with dots, for those who need no spec: importing this is
+quick.
+"""
 
+import re
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -7,6 +10,8 @@ Method = Literal["ssail", "gail", "wail", "bc", "nri", "dnri", "constant-velocit
 METHODS: tuple[str, ...] = get_args(Method)
 Environment = Literal["yjunction", "letters", "mocap", "trajectories"]
 ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
+# "module:function", or "module:function@digest" once the file has been read; see ssmail.config.user_functions
+FUNCTION = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*)(@(?P<digest>[0-9a-f]{12}))?")
 
 
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

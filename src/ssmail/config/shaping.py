@@ -4,15 +4,14 @@
 """
 
 import math
-import re
 from itertools import pairwise
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
+from ssmail.config.names import FUNCTION
+
 LABELS = ("identity", "zero-above-one")
-# "module:function", or "module:function@digest" once the file has been read; see ssmail.config.user_functions
-FUNCTION = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*)(@(?P<digest>[0-9a-f]{12}))?")
 
 
 def read_alpha(value: Any) -> Any:

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Self, cast
 
 from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import PACKAGE, find_file
-from ssmail.config.shaping import FUNCTION
+from ssmail.config.names import FUNCTION
 from ssmail.errors import InputError, suggestion
 
 if TYPE_CHECKING:
