@@ -80,7 +80,7 @@ RunId = Annotated[
     typer.Argument(metavar="RUN", help="The id of a run, or its first digits.", autocompletion=completion.run_ids),
 ]
 METHOD_NAMES, ENVIRONMENT_NAMES = listed(METHODS), listed(ENVIRONMENTS)
-PROFILE_NAMES = "smoke, quick, paper, or one of your experiments.yaml"
+PROFILE_NAMES = "smoke, quick, standard, paper, or one of your experiments.yaml"
 Method = Annotated[
     str | None,
     typer.Option(
@@ -175,7 +175,8 @@ TrainingProfile = Annotated[
     typer.Option(
         "--profile",
         metavar="PROFILE",
-        help="smoke (seconds), quick (minutes), paper (the paper's scale: hours), or one of your experiments.yaml.",
+        help="smoke (seconds), quick (minutes), standard (quick, with an exact ssail on yjunction), paper (the paper's "
+        "scale: hours), or one of your experiments.yaml.",
         autocompletion=completion.profiles,
     ),
 ]

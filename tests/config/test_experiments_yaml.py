@@ -27,7 +27,7 @@ def test_no_two_entries_are_the_same_cell() -> None:
 def test_the_file_names_every_method_and_environment() -> None:
     assert set(EXPERIMENTS.methods) == set(METHODS)
     assert set(EXPERIMENTS.environments) == set(ENVIRONMENTS)
-    assert set(EXPERIMENTS.profiles) == {"smoke", "quick", "paper"}
+    assert set(EXPERIMENTS.profiles) == {"smoke", "quick", "standard", "paper"}
 
 
 @pytest.mark.parametrize("figure", EXPERIMENTS.figures)

@@ -120,7 +120,7 @@ def test_every_run_has_its_spec_and_what_tells_it_from_others(written: Written) 
     start = written.html.index(f'<details id="spec-{chosen}">')
     spec = Page(written.html[start : written.html.index("</details>", start) + len("</details>")])
     assert spec.problems == []
-    assert "yjunction, ssail, smoke: beta 0.15" in spec.words()
+    assert "yjunction, ssail, smoke + curriculum.beta=0.15: beta 0.15" in spec.words()
     assert "edge_types: 2" in spec.words()
     assert "name: trajectory-forcing" in spec.words()
 
