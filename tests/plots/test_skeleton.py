@@ -94,7 +94,7 @@ def test_picture_and_csv_show_the_record(data: Path, tmp_path: Path) -> None:
     image, csv = save_figure(record.stem, record, figure, tmp_path / "out", ["png"])
     table = pd.read_csv(csv, keep_default_na=False)
     written = hashlib.sha256(csv.read_bytes()).hexdigest()
-    assert provenance.read(image) == replace(record.provenance, csv_sha256=written)
+    assert provenance.read(image) == replace(record.provenance, caption=record.caption, csv_sha256=written)
     assert len(table) == 5 * len(JOINTS)
     assert len(figure.axes) == 5
     scales = set()

@@ -42,6 +42,7 @@ DIFFER = {
         *(f"adversarial.{k}" for k in ("input_noise", "reward_limit")),
         *(f"sac.{k}" for k in ("gamma", "actor_learning_rate", "actor_start", "critic_learning_rate_final")),
         *(f"sac.{k}" for k in ("temperature_learning_rate", "target_entropy", "encoder_steps")),
+        *(f"sac.{k}" for k in ("expansion_steps", "graph_entropy", "average")),
         "curriculum.name",
     },
 }

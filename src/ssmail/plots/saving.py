@@ -44,7 +44,7 @@ def save_film(pictures: Sequence[Image.Image], path: Path, milliseconds: Sequenc
     Creates the folder. Raises InputError when it cannot be written.
     """
     first, *rest = pictures
-    comment = replace(record.provenance, caption=record.caption).as_json()
+    comment = replace(record.provenance, caption=printable(record.caption)).as_json()
     film = {"append_images": rest, "duration": list(milliseconds), "loop": 0, "comment": comment}
     with _explained(path.parent), atomic_write(path) as partial:
         first.save(partial, format="GIF", save_all=True, **film)
@@ -75,4 +75,4 @@ def digest(csv: str) -> str:
 
 def embedded(record: FigureRecord, csv: str) -> Provenance:
     """Return the provenance that is written into the files: the record's, with its caption and the hash of its CSV."""
-    return replace(record.provenance, caption=record.caption, csv_sha256=digest(csv))
+    return replace(record.provenance, caption=printable(record.caption), csv_sha256=digest(csv))

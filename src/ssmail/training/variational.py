@@ -134,7 +134,7 @@ class _GraphSampler:
         logits = self._of_samples(self._prior(states))
         assert self.memory is not None
         groups, _, agents, _ = states.shape
-        by_group = (part.view(len(part), groups, agents * (agents - 1), -1) for part in self.memory)
+        by_group = (part.view(len(part), groups, agents * (agents - 1), part.shape[-1]) for part in self.memory)
         hidden, cell = (self._of_samples(part, 1).flatten(1, 2) for part in by_group)
         self.memory = hidden, cell
         return self._next(logits)
