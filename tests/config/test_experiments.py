@@ -167,7 +167,7 @@ def test_no_override_ends_in_anything_but_a_spec_or_an_input_error(key: str, val
         (("ssial", "yjunction", "quick"), "unknown method 'ssial'; did you mean ssail?"),
         (("ssail", "y-junction", "quick"), "unknown environment 'y-junction'; did you mean yjunction?"),
         (("ssail", "yjunction", "qiuck"), "unknown profile 'qiuck'; did you mean quick?"),
-        (("ssail", "yjunction", "zzz"), "unknown profile 'zzz'; choose from smoke, quick, paper."),
+        (("ssail", "yjunction", "zzz"), "unknown profile 'zzz'; choose from smoke, quick, standard, paper."),
     ],
 )
 def test_a_misspelt_name_is_met_with_the_nearest(cell: tuple[str, str, str], sentence: str) -> None:
