@@ -190,6 +190,19 @@ def rest_of(run: RunRow, *keys: str) -> str:
     return json.dumps(values, sort_keys=True)
 
 
+def check_alike(figure: str, runs: Sequence[RunRow], *keys: str) -> None:
+    """Raise InputError, naming a key, if a run differs from the first one in more than these keys."""
+    first, known = runs[0], flatten(runs[0].spec)
+    for run in runs:
+        other = flatten(run.spec)
+        differs = [name for name in known | other if name not in keys and known.get(name) != other.get(name)]
+        if differs:
+            raise InputError(
+                f"runs {first.name} and {run.name} differ in {differs[0]}, but {figure} compares runs that differ in "
+                f"{' and '.join(keys)} alone; leave one of them out."
+            )
+
+
 def grouped(runs: Sequence[RunRow], mark: Callable[[RunRow], str]) -> list[list[RunRow]]:
     """Return runs of an equal mark together, in the order of their first appearance."""
     found: dict[str, list[RunRow]] = {}

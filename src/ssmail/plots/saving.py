@@ -44,7 +44,7 @@ def save_film(pictures: Sequence[Image.Image], path: Path, milliseconds: Sequenc
     Creates the folder. Raises InputError when it cannot be written.
     """
     first, *rest = pictures
-    comment = replace(record.provenance, caption=printable(record.caption)).as_json()
+    comment = embedded(record).as_json()
     film = {"append_images": rest, "duration": list(milliseconds), "loop": 0, "comment": comment}
     with _explained(path.parent), atomic_write(path) as partial:
         first.save(partial, format="GIF", save_all=True, **film)
@@ -73,6 +73,7 @@ def digest(csv: str) -> str:
     return hashlib.sha256(csv.encode()).hexdigest()
 
 
-def embedded(record: FigureRecord, csv: str) -> Provenance:
-    """Return the provenance that is written into the files: the record's, with its caption and the hash of its CSV."""
-    return replace(record.provenance, caption=printable(record.caption), csv_sha256=digest(csv))
+def embedded(record: FigureRecord, csv: str | None = None) -> Provenance:
+    """Return the provenance for files: the record's, with its caption and, if there is a CSV, the hash of it."""
+    found = replace(record.provenance, caption=printable(record.caption))
+    return found if csv is None else replace(found, csv_sha256=digest(csv))

@@ -25,7 +25,6 @@ from ssmail.config.experiments import (
     figure_requirements,
 )
 from ssmail.config.experiments_file import load_experiments
-from ssmail.config.names import flatten
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, command_line
 from ssmail.plots import NoRuns
@@ -36,6 +35,7 @@ from ssmail.plots.run_groups import (
     Group,
     Selection,
     by_spec,
+    check_alike,
     check_one_data_set,
     choice_note,
     every_spec,
@@ -193,17 +193,10 @@ def _given(needed: _Comparison, runs: Sequence[RunRow]) -> Selection:
 
 
 def _check_one_family(figure: str, key: str, runs: Sequence[RunRow]) -> None:
-    first, known = runs[0], flatten(runs[0].spec)
     for run in runs:
         if value_of(run, key) is ABSENT:
             raise InputError(f"run {run.name} ({run.method}) has no {key}, which {figure} compares; leave it out.")
-        other = flatten(run.spec)
-        differs = [name for name in known | other if name != key and known.get(name) != other.get(name)]
-        if differs:
-            raise InputError(
-                f"runs {first.name} and {run.name} differ in {differs[0]}, but {figure} compares runs that differ in "
-                f"{key} alone; leave one of them out."
-            )
+    check_alike(figure, runs, key)
 
 
 def _families(needed: _Comparison, stored: Sequence[RunRow]) -> list[Family]:

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
-from ssmail.config.names import flatten
 from ssmail.errors import InputError, command_line
 from ssmail.plots import NoRuns
 from ssmail.plots.formatting import counted, setting, spans
@@ -17,6 +16,7 @@ from ssmail.plots.run_groups import (
     Group,
     Selection,
     by_spec,
+    check_alike,
     check_one_data_set,
     check_settled,
     grouped,
@@ -50,19 +50,11 @@ def select(store: Store, runs: Sequence[RunRow], keys: Sequence[str], named: boo
 def _checked(runs: Sequence[RunRow], keys: Sequence[str]) -> list[RunRow]:
     """Return the runs. Raises InputError for one that differs from the first in more than the keys."""
     check_settled(runs, "test results")
-    first = flatten(runs[0].spec)
     for run in runs:
         for key in keys:
             if value_of(run, key) is ABSENT:
                 raise InputError(f"run {run.name} ({run.method}) has no {key}; leave it out.")
-        if rest_of(run, *keys) != rest_of(runs[0], *keys):
-            other = flatten(run.spec)
-            differs = next(key for key in first | other if key not in keys and first.get(key) != other.get(key))
-            told = " and ".join(keys)
-            raise InputError(
-                f"runs {runs[0].name} and {run.name} differ in {differs}, but {NAME} compares runs that differ in "
-                f"{told} alone; leave one of them out."
-            )
+    check_alike(NAME, runs, *keys)
     return list(runs)
 
 
