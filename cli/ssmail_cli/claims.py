@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import command_line
+from ssmail.paper.results import CLAIMS, FIGURES
 from ssmail_cli import completion, options
 from ssmail_cli.output import WIDEST, Format, chosen_format, note, print_rows, print_table, say, short, write_json
 
@@ -27,7 +28,7 @@ SUMMARY = {
     "more_seeds": "more seeds",
 }
 SPARE = ("profile", "more_seeds", "p", "corrected", "p_holm")  # what a narrow terminal leaves out first
-NAMES = "C1 to C8, or stability, modes, beta, noise, alpha, curricula, landscapes, vector-field"
+NAMES = f"C1 to C{len(CLAIMS)}, or {', '.join(FIGURES[figure].alias for figure in CLAIMS)}"
 LEGEND = (
     "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns count all "
     "eight claims; docs/claims.md has the tests and thresholds."
@@ -81,7 +82,7 @@ def claims(
     for found in judgements if wanted else ():
         say("", *_claim_lines(found))
     if not wanted:
-        command = command_line("ssmail", "claims", "C4", *(() if db == options.DEFAULT_DATABASE else ("--db", db)))
+        command = command_line("ssmail", "claims", "C4", *options.database_words(db))
         say(*_wrapped(f"`{command}` shows what C4 is decided by: its parts, their tests, every seed.", 0))
 
 

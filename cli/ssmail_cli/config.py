@@ -9,11 +9,15 @@ from typing import Annotated, Any
 
 import typer
 
+from ssmail.config.names import DEFAULT_ENVIRONMENT, DEFAULT_METHOD
 from ssmail.errors import InputError, printable, shortened
 from ssmail_cli import completion, options
+from ssmail_cli.command_group import Commands
 from ssmail_cli.output import Format, chosen_format, note, print_rows, say, write_json
 
-app = typer.Typer(help="Show the settings of a run and what they mean, or write your own.", rich_markup_mode=None)
+app = typer.Typer(
+    cls=Commands, help="Show the settings of a run and what they mean, or write your own.", rich_markup_mode=None
+)
 
 SHOWN = {"key": "key", "value": "value", "layer": "from"}
 REFERENCE = {name: name for name in ("key", "type", "unit", "range", "default", "meaning")}
@@ -30,8 +34,8 @@ Keys = Annotated[
 @app.command()
 def show(
     keys: Keys = None,
-    method: options.SpecMethod = "ssail",
-    environment: options.SpecEnvironment = "yjunction",
+    method: Annotated[str, options.method_option("The method")] = DEFAULT_METHOD,
+    environment: Annotated[str, options.environment_option("The environment")] = DEFAULT_ENVIRONMENT,
     profile: options.TrainingProfile = "quick",
     settings: options.Settings = None,
     as_json: options.Json = False,

@@ -4,7 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from ssmail.errors import InputError, unknown_name
 from ssmail.paper.results import FIGURES
@@ -85,3 +85,26 @@ class FigureGroup(Commands):
         }
         for_others = self.SHARED & set().union(*options.values()) - options.get(name, set())
         return [token for key, tokens in given.items() if key not in for_others for token in tokens]
+
+
+class FigureCommand(TyperCommand):
+    """The command of a figure of the paper, without the options that the figure does not have.
+
+    What does not go together is refused while the options are parsed, before anything is drawn.
+    """
+
+    def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
+        module = FIGURES[name]
+        lacks = {"environment": not module.has_environment, "stat": not module.has_statistic}
+        kept = [item for item in params if not lacks.get(item.name)]
+        for item in kept:
+            if item.name == "stat":
+                item.show_default = module.statistic
+        super().__init__(name, params=kept, **settings)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the options. Raises InputError for two choices of runs."""
+        rest = super().parse_args(ctx, args)
+        if ctx.params["runs"] and ctx.params["profile"]:
+            raise InputError("--runs names the runs already; leave --profile out.")
+        return rest

@@ -3,7 +3,7 @@
 import re
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -27,6 +27,29 @@ STATES = ("queued", "running", "finished", "failed", "diverged", "interrupted")
 AUTO = "auto"
 DEVICES = (AUTO, "cpu", "cuda")
 _DEVICE = re.compile(r"auto|cpu|cuda(:\d{1,3})?", re.ASCII)
+
+
+def method_option(what: str, more: str = "", **shown: Any) -> Any:
+    """Return the option --method. Its help is `what`, the methods, and `more`."""
+    text = f"{what}: {listed(METHODS)}{more}."
+    return typer.Option("--method", metavar="METHOD", help=text, autocompletion=completion.methods, **shown)
+
+
+def environment_option(what: str, more: str = "", **shown: Any) -> Any:
+    """Return the option --env. Its help is `what`, the environments, and `more`."""
+    text = f"{what}: {listed(ENVIRONMENTS)}{more}."
+    return typer.Option("--env", metavar="ENV", help=text, autocompletion=completion.environments, **shown)
+
+
+def _profile_option(**shown: Any) -> Any:
+    text = "Only runs of this profile: smoke, quick, standard, paper, or one of your experiments.yaml."
+    return typer.Option("--profile", metavar="PROFILE", help=text, autocompletion=completion.profiles, **shown)
+
+
+def metric_option(verb: str, **shown: Any) -> Any:
+    """Return the repeatable option --metric. `verb`: what the command does with the metrics."""
+    text = f"{verb} this metric, which `ssmail runs show RUN` lists; repeatable."
+    return typer.Option("--metric", metavar="METRIC", help=text, autocompletion=completion.metrics, **shown)
 
 
 def _known_formats(formats: list[str]) -> list[str]:
@@ -56,6 +79,12 @@ def known_statistic(stat: str | None) -> str | None:
     return stat
 
 
+def stat_option(default: str, what: str = "Centre and band") -> Any:
+    """Return the option --stat. `what` it chooses, and what is chosen by `default`."""
+    text = f"{what}: mean-std, median-iqr or mean-ci."
+    return typer.Option("--stat", callback=known_statistic, help=text, show_default=default)
+
+
 Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
@@ -79,55 +108,10 @@ RunId = Annotated[
     str,
     typer.Argument(metavar="RUN", help="The id of a run, or its first digits.", autocompletion=completion.run_ids),
 ]
-METHOD_NAMES, ENVIRONMENT_NAMES = listed(METHODS), listed(ENVIRONMENTS)
-PROFILE_NAMES = "smoke, quick, standard, paper, or one of your experiments.yaml"
-Method = Annotated[
-    str | None,
-    typer.Option(
-        "--method",
-        metavar="METHOD",
-        help=f"Only runs of this method: {METHOD_NAMES}.",
-        autocompletion=completion.methods,
-    ),
-]
-Environment = Annotated[
-    str | None,
-    typer.Option(
-        "--env",
-        metavar="ENV",
-        help=f"Only runs on this environment: {ENVIRONMENT_NAMES}.",
-        autocompletion=completion.environments,
-    ),
-]
-SpecMethod = Annotated[
-    str,
-    typer.Option("--method", metavar="METHOD", help=f"The method: {METHOD_NAMES}.", autocompletion=completion.methods),
-]
-SpecEnvironment = Annotated[
-    str,
-    typer.Option(
-        "--env", metavar="ENV", help=f"The environment: {ENVIRONMENT_NAMES}.", autocompletion=completion.environments
-    ),
-]
-Profile = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        metavar="PROFILE",
-        help=f"Only runs of this profile: {PROFILE_NAMES}.",
-        autocompletion=completion.profiles,
-    ),
-]
-FigureProfile = Annotated[
-    str | None,
-    typer.Option(
-        "--profile",
-        metavar="PROFILE",
-        help=f"Only runs of this profile: {PROFILE_NAMES}.",
-        show_default="the one that each figure draws",
-        autocompletion=completion.profiles,
-    ),
-]
+Method = Annotated[str | None, method_option("Only runs of this method")]
+Environment = Annotated[str | None, environment_option("Only runs on this environment")]
+Profile = Annotated[str | None, _profile_option()]
+FigureProfile = Annotated[str | None, _profile_option(show_default="the one that each figure draws")]
 State = Annotated[
     str | None,
     typer.Option(
@@ -208,26 +192,25 @@ DeviceOption = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would run, and train nothing.")]
 
 # Drawing
-STATISTICS = "mean-std, median-iqr or mean-ci"
 OutDir = Annotated[Path, typer.Option("--out", help="The folder for the figures and their CSV files.")]
 Formats = Annotated[
     list[str],
     typer.Option("--format", callback=_known_formats, help="png, pdf or svg; repeatable.", show_default="png"),
 ]
-Stat = Annotated[
-    str | None,
-    typer.Option("--stat", callback=known_statistic, help=f"Centre and band: {STATISTICS}.", show_default="mean-std"),
-]
+Stat = Annotated[str | None, stat_option("mean-std")]
 _WITH_STATISTIC = list(dict.fromkeys(figure.name for figure in FIGURES.values() if figure.has_statistic))
 StatOfFigures = Annotated[
     str | None,
-    typer.Option(
-        "--stat",
-        callback=known_statistic,
-        help=f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}: {STATISTICS}.",
-        show_default="median-iqr on logarithmic axes, else mean-std",
+    stat_option(
+        "median-iqr on logarithmic axes, else mean-std",
+        f"Centre and band of {', '.join(_WITH_STATISTIC[:-1])} and {_WITH_STATISTIC[-1]}",
     ),
 ]
+
+
+def database_words(db: str) -> tuple[str, ...]:
+    """Return how a command line names the database; not at all where it is the default one."""
+    return () if db == DEFAULT_DATABASE else ("--db", db)
 
 
 def named(words: list[str] | None, option: str | None) -> list[str]:

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from typer.core import TyperCommand
 
 from ssmail.errors import ExitCode, InputError, stored_values, unknown_name
 from ssmail.paper.results import FIGURES
 from ssmail_cli import completion, options
-from ssmail_cli.figure_group import ALL, FigureGroup
+from ssmail_cli.figure_group import ALL, FigureCommand, FigureGroup
 from ssmail_cli.options import open_store, parse_statistic
 from ssmail_cli.output import note, say
 from ssmail_cli.report import draw_all
@@ -88,15 +87,7 @@ OnlyRuns = Annotated[
         help="Only these runs (ids or their first digits); repeatable.",
     ),
 ]
-Methods = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--method",
-        metavar="METHOD",
-        help=f"Only runs of this method: {options.METHOD_NAMES}; repeatable.",
-        autocompletion=completion.methods,
-    ),
-]
+Methods = Annotated[list[str] | None, options.method_option("Only runs of this method", "; repeatable")]
 OneRun = Annotated[
     str,
     typer.Option(
@@ -108,40 +99,10 @@ OneRun = Annotated[
 ]
 
 
-class FigureCommand(TyperCommand):
-    """The command of a figure of the paper, without the options that the figure does not have.
-
-    What does not go together is refused while the options are parsed, before anything is drawn.
-    """
-
-    def __init__(self, name: str, *, params: list[Any], **settings: Any) -> None:
-        module = FIGURES[name]
-        lacks = {"environment": not module.has_environment, "stat": not module.has_statistic}
-        kept = [item for item in params if not lacks.get(item.name)]
-        for item in kept:
-            if item.name == "stat":
-                item.show_default = module.statistic
-        super().__init__(name, params=kept, **settings)
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the options. Raises InputError for two choices of runs."""
-        rest = super().parse_args(ctx, args)
-        if ctx.params["runs"] and ctx.params["profile"]:
-            raise InputError("--runs names the runs already; leave --profile out.")
-        return rest
-
-
 def figure(
     ctx: typer.Context,
     environment: Annotated[
-        str | None,
-        typer.Option(
-            "--env",
-            metavar="ENV",
-            help=f"Draw the runs on this environment: {options.ENVIRONMENT_NAMES}.",
-            show_default="the paper's",
-            autocompletion=completion.environments,
-        ),
+        str | None, options.environment_option("Draw the runs on this environment", show_default="the paper's")
     ] = None,
     runs: FigureRuns = None,
     profile: options.Profile = None,
@@ -163,7 +124,7 @@ for _module in dict.fromkeys(FIGURES.values()):
 
 
 @app.command(ALL, epilog=EPILOG)
-def every_figure(ctx: typer.Context, profile: options.Profile = None, stat: options.Stat = None) -> None:
+def every_figure(ctx: typer.Context, profile: options.Profile = None, stat: options.StatOfFigures = None) -> None:
     """Every figure of the paper whose runs are stored, and forecast and trajectories of each data set.
 
     For each of the others, prints on stderr the command that computes its runs; the exit code is then 3. Where all runs
@@ -179,12 +140,8 @@ def training(
     ctx: typer.Context,
     metrics: Annotated[
         list[str] | None,
-        typer.Option(
-            "--metric",
-            metavar="METRIC",
-            help="Draw this metric, which `ssmail runs show RUN` lists; repeatable.",
-            autocompletion=completion.metrics,
-            show_default="; ".join(f"{shown.curve} of {name}" for name, shown in ENVIRONMENT_METRICS.items()),
+        options.metric_option(
+            "Draw", show_default="; ".join(f"{shown.curve} of {name}" for name, shown in ENVIRONMENT_METRICS.items())
         ),
     ] = None,
     methods: Methods = None,
@@ -234,30 +191,13 @@ def ablation(
             autocompletion=completion.varied,
         ),
     ],
-    metrics: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--metric",
-            metavar="METRIC",
-            help="Draw this metric; repeatable.",
-            show_default="the test error",
-            autocompletion=completion.metrics,
-        ),
-    ] = None,
+    metrics: Annotated[list[str] | None, options.metric_option("Draw", show_default="the test error")] = None,
     methods: Methods = None,
     environment: options.Environment = None,
     profile: options.Profile = None,
     where: options.Where = None,
     runs: OnlyRuns = None,
-    stat: Annotated[
-        str | None,
-        typer.Option(
-            "--stat",
-            callback=options.known_statistic,
-            help=f"Centre and spread: {options.STATISTICS}.",
-            show_default="median-iqr",
-        ),
-    ] = None,
+    stat: Annotated[str | None, options.stat_option("median-iqr", "Centre and spread")] = None,
 ) -> None:
     """Any metric against the values of a key of the spec, or of two, as `ssmail ablate KEY` trains them.
 
@@ -292,15 +232,7 @@ def forecast(
     error: Annotated[
         str, typer.Option("--error", help="mse (scaled units) or distance (units of the data, where stored).")
     ] = "mse",
-    stat: Annotated[
-        str | None,
-        typer.Option(
-            "--stat",
-            callback=options.known_statistic,
-            help=f"Centre and band: {options.STATISTICS}.",
-            show_default="mean-ci",
-        ),
-    ] = None,
+    stat: Annotated[str | None, options.stat_option("mean-ci")] = None,
 ) -> None:
     """The error of forecasts over the predicted steps, of any methods: a figure for each data set.
 

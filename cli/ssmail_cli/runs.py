@@ -54,6 +54,10 @@ SPARE = ("spec", "started")  # what a narrow terminal leaves out first
 EXPORT_COLUMNS = ("run_id", "method", "environment", "profile", "seed", "state", "spec_hash", "name", "step", "value")
 
 
+def _limit_option(what: str) -> Any:
+    return typer.Option("--limit", min=1, help=f"Only so many {what}: the newest, or with --sort the first.")
+
+
 @app.command("list")
 def list_runs(
     ids: options.RunIds = None,
@@ -65,10 +69,7 @@ def list_runs(
     where: options.Where = None,
     sort: options.Sort = None,
     descending: options.Descending = False,
-    limit: Annotated[
-        int | None,
-        typer.Option("--limit", min=1, help="Only so many runs: the newest, or with --sort the first."),
-    ] = None,
+    limit: Annotated[int | None, _limit_option("runs")] = None,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,
@@ -130,14 +131,11 @@ def compare(
     ids: options.RunIds = None,
     metrics: Annotated[
         list[str] | None,
-        typer.Option(
-            "--metric",
-            metavar="METRIC",
-            help="Compare this metric, which `ssmail runs show RUN` lists; repeatable.",
+        options.metric_option(
+            "Compare",
             show_default="; ".join(
                 f"{', '.join(shown.compared)} of {name}" for name, shown in ENVIRONMENT_METRICS.items()
             ),
-            autocompletion=completion.metrics,
         ),
     ] = None,
     method: options.Method = None,
@@ -148,10 +146,7 @@ def compare(
     where: options.Where = None,
     sort: options.Sort = None,
     descending: options.Descending = False,
-    limit: Annotated[
-        int | None,
-        typer.Option("--limit", min=1, help="Only so many specs: the newest, or with --sort the first."),
-    ] = None,
+    limit: Annotated[int | None, _limit_option("specs")] = None,
     as_json: options.Json = False,
     form: options.Output = None,
     db: options.Database = options.DEFAULT_DATABASE,

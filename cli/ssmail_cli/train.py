@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperCommand
 
+from ssmail.config.names import DEFAULT_ENVIRONMENT, DEFAULT_METHOD
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
@@ -32,23 +33,11 @@ def train(
     ] = None,
     methods: Annotated[
         list[str] | None,
-        typer.Option(
-            "--method",
-            metavar="METHOD",
-            help=f"The method to train: {options.METHOD_NAMES}; repeatable.",
-            show_default="ssail",
-            autocompletion=completion.methods,
-        ),
+        options.method_option("The method to train", "; repeatable", show_default=DEFAULT_METHOD),
     ] = None,
     environments: Annotated[
         list[str] | None,
-        typer.Option(
-            "--env",
-            metavar="ENV",
-            help=f"The environment to train on: {options.ENVIRONMENT_NAMES}; repeatable.",
-            show_default="yjunction",
-            autocompletion=completion.environments,
-        ),
+        options.environment_option("The environment to train on", "; repeatable", show_default=DEFAULT_ENVIRONMENT),
     ] = None,
     profile: options.TrainingProfile = "quick",
     seeds: options.Seeds = "0",
@@ -69,8 +58,8 @@ def train(
     from ssmail.execution.cells import Cell
 
     chosen_seeds = parse_seeds(seeds)
-    chosen = list(dict.fromkeys([*(names or ()), *(methods or ())])) or ["ssail"]
-    places = list(dict.fromkeys(environments or ())) or ["yjunction"]
+    chosen = list(dict.fromkeys([*(names or ()), *(methods or ())])) or [DEFAULT_METHOD]
+    places = list(dict.fromkeys(environments or ())) or [DEFAULT_ENVIRONMENT]
     sweep: dict[Cell, dict[str, Any]] = {}
     for environment, method in product(places, chosen):
         spec = build_spec(method, environment, profile, settings or [])
@@ -104,16 +93,12 @@ def ablate(
     ] = None,
     method: Annotated[
         str | None,
-        typer.Option("--method", help="The method to train.", show_default="the ablation's, and ssail for a key"),
+        options.method_option("Train this method", show_default=f"the ablation's, and {DEFAULT_METHOD} for a key"),
     ] = None,
     environment: Annotated[
         str | None,
-        typer.Option(
-            "--env",
-            metavar="ENV",
-            help=f"Train on this environment: {options.ENVIRONMENT_NAMES}.",
-            show_default="the ablation's, and yjunction for a key",
-            autocompletion=completion.environments,
+        options.environment_option(
+            "Train on this environment", show_default=f"the ablation's, and {DEFAULT_ENVIRONMENT} for a key"
         ),
     ] = None,
     profile: options.TrainingProfile = "quick",
@@ -214,7 +199,7 @@ def _columns(keys: Sequence[str]) -> list[str]:
 
 def _point_to_figures(names: Sequence[str], keys: Sequence[str], trained: "RunSpec", db: str) -> None:
     """Print the command for each figure of the paper that draws these runs, else the one that draws any ablation."""
-    from ssmail.config.experiments import DEFAULT_ENVIRONMENT, DEFAULT_METHOD, figure_requirements
+    from ssmail.config.experiments import figure_requirements
     from ssmail.config.experiments_file import load_experiments
 
     commands = []
@@ -228,6 +213,5 @@ def _point_to_figures(names: Sequence[str], keys: Sequence[str], trained: "RunSp
         where = ("--env", trained.environment) if trained.environment != DEFAULT_ENVIRONMENT else ()
         which = ("--method", trained.method) if trained.method != DEFAULT_METHOD else ()
         commands.append(("ablation", *(word for key in keys for word in ("--key", key)), *which, *where))
-    database = () if db == options.DEFAULT_DATABASE else ("--db", db)
     for command in commands:
-        note(f"`{command_line('ssmail', 'plot', *command, *database)}` draws these runs")
+        note(f"`{command_line('ssmail', 'plot', *command, *options.database_words(db))}` draws these runs")

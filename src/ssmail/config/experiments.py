@@ -16,7 +16,7 @@ from yaml.constructor import ConstructorError
 
 from ssmail.config import strict_yaml
 from ssmail.config.experiments_file import ABLATION_LAYERS, LAYERS, Experiments, Layer, load_experiments, merge
-from ssmail.config.names import ENVIRONMENTS, METHODS, flatten
+from ssmail.config.names import DEFAULT_ENVIRONMENT, DEFAULT_METHOD, ENVIRONMENTS, METHODS, flatten
 from ssmail.config.spec import (
     GENERATED_ENVIRONMENTS,
     OPTIONAL_SECTIONS,
@@ -30,7 +30,6 @@ from ssmail.config.spec import (
 from ssmail.config.user_functions import UserFunction, search_folders
 from ssmail.errors import InputError, shortened, suggestion
 
-DEFAULT_METHOD, DEFAULT_ENVIRONMENT = "ssail", "yjunction"  # of a command that names none
 MOST_SPECS = 1000  # in a grid
 _LABEL = "self_supervision.label"
 _SHOWN = 80  # characters of an argument in a message

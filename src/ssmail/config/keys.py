@@ -23,8 +23,6 @@ from ssmail.config.spec import (
 from ssmail.config.value_types import Frozen, Unit
 
 _KINDS = {bool: "true, false", int: "whole number", float: "number", str: "text", tuple: "list", NoneType: "null"}
-
-
 _BRACKETS = {"ge": ("[", "≥"), "gt": ("(", ">"), "le": ("]", "≤"), "lt": (")", "<")}
 
 

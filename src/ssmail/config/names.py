@@ -14,6 +14,10 @@ ENVIRONMENTS: tuple[str, ...] = get_args(Environment)
 FUNCTION = re.compile(r"(?P<module>[^\W\d]\w*(\.[^\W\d]\w*)*):(?P<name>[^\W\d]\w*)(@(?P<digest>[0-9a-f]{12}))?")
 
 
+DEFAULT_METHOD: Method = "ssail"  # of a command that names none
+DEFAULT_ENVIRONMENT: Environment = "yjunction"  # likewise
+
+
 def flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested values by dotted key: {"a": {"b": 1}} -> {"a.b": 1}. An empty mapping counts as a value."""
     flat: dict[str, Any] = {}
