@@ -189,8 +189,8 @@ class SacSpec(Frozen):
     expansion_start: Start
     """When value expansion begins; before, the critics estimate all."""
     finite_horizon: bool
-    """Nothing counts that would come after a trajectory's last step, as the time in model.time_input tells; otherwise
-    the critics estimate it, at a time that they never learn from."""
+    """The value after a trajectory's last step is zero, for tasks whose time is an input (model.time_input); otherwise
+    the critics bootstrap there, from a time step that they are never trained on."""
     graph_entropy: NonNegative
     """Weight of the edge types' entropy in the actor's objective."""
     average: Inside | None

@@ -5,7 +5,7 @@ are scalars, or (S,). Temperatures are scalars or broadcast to the tensors.
 
 Implementations of SAC differ silently in some choices. In ssmail the target entropy is given per action dimension
 (spec: sac.target_entropy), the temperature loss is on the log temperature, and episodes end by truncation: no state is
-terminal, unless sac.finite_horizon says that nothing comes after a trajectory's last step.
+terminal, unless sac.finite_horizon sets the value after a trajectory's last step to zero.
 """
 
 import torch

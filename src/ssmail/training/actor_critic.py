@@ -270,7 +270,7 @@ class SoftActorCritic:
         return -value.mean(dim=PER_SEED), first_log_prob
 
     def _discount(self, at: Transitions, ahead: int) -> Tensor | float:
-        """Return what the value `ahead` steps after the transitions counts: gamma**ahead, or with a finite horizon
+        """Return the discount of the value `ahead` steps after the transitions: gamma**ahead or, with a finite horizon,
         (S, 1, C, 1) with zeros where the trajectory has ended by then.
         """
         discount: float = self.spec.gamma**ahead

@@ -55,8 +55,8 @@ class Reading(TypedDict, total=False):
     """How a predictor reads and acts in `Predictor.free_run`; by default it samples once, without noise.
 
     deterministic: replace sampled actions by their means. noise: (B, H + steps - 1, N, D), added to every state read;
-    not with several samples. samples: how many futures S of each group; the B trajectories that are returned are then
-    S times as many as observed, all groups' first ones first.
+    not with several samples. samples: futures of each group; samples * B trajectories are returned, the first sample of
+    every group, then the second, and so on.
     """
 
     deterministic: bool

@@ -86,8 +86,9 @@ class PolicyPredictor:
         environment's state stays clean. With the weights of S seeds, all of this has another axis S in front, and
         there is one generator per seed.
 
-        With several `samples` the rollout has S * B trajectories, all groups' first ones first. What the policy
-        observes is then read once for each group, and the graphs of the following steps are inferred by GraphSteps.
+        With several `samples` of each group the rollout has samples * B trajectories: the first sample of every group,
+        then the second, and so on. The policy reads each group's observed states once, and GraphSteps infers the graphs
+        of the following steps.
         """
         policy, (*lead, h, n, _) = self.model, observed.shape
         groups, a = lead[-1], policy.action_size
