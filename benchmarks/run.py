@@ -4,6 +4,7 @@ training grows with the number of agents.
 Training uses one thread.
 """
 
+import os
 import statistics
 import subprocess
 import sys
@@ -34,9 +35,29 @@ def seconds(work: Callable[[], object], times: int) -> float:
 
 def help_text() -> float:
     """Time `ssmail --help` in a new process."""
-    return seconds(
-        lambda: subprocess.run([sys.executable, "-m", "ssmail_cli", "--help"], capture_output=True, check=True), 7
-    )
+    return cpu_seconds(["--help"], {})
+
+
+def completion() -> float:
+    """Time the completion of keys after --set in a new process, as bash asks for it."""
+    words = {"COMP_WORDS": "ssmail train --set sac.", "COMP_CWORD": "3"}
+    return cpu_seconds([], {"_SSMAIL_COMPLETE": "complete_bash", **words})
+
+
+def cpu_seconds(arguments: list[str], environment: dict[str, str]) -> float:
+    """Return the median CPU time of `ssmail` in a new process."""
+    taken = []
+    for _ in range(9):
+        before = os.times()
+        subprocess.run(
+            [sys.executable, "-m", "ssmail_cli", *arguments],
+            env={**os.environ, **environment},
+            capture_output=True,
+            check=True,
+        )
+        after = os.times()
+        taken.append(after.children_user + after.children_system - before.children_user - before.children_system)
+    return statistics.median(taken)
 
 
 def epoch() -> float:
@@ -58,7 +79,12 @@ def stored_epoch() -> float:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    for name, measure in (("ssmail --help", help_text), ("epoch (quick)", epoch), ("stored epoch", stored_epoch)):
+    for name, measure in (
+        ("ssmail --help", help_text),
+        ("completion", completion),
+        ("epoch (quick)", epoch),
+        ("stored epoch", stored_epoch),
+    ):
         print(f"{name:<16}{measure():9.4f} s", flush=True)
     compare()
     report(["authors", "quick"])
