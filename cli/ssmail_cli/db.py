@@ -28,7 +28,7 @@ class DatabaseGroup(Commands):
 
 app = typer.Typer(
     cls=DatabaseGroup,
-    help="Inspect, check, back up, merge and export an SQLite database; `ssmail db` alone shows what it holds.",
+    help="Inspect, check, back up, merge and export a database; `ssmail db` alone shows what it holds.",
     rich_markup_mode=None,
 )
 
@@ -62,7 +62,7 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
 def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
     """Bring the tables to the newest schema.
 
-    First writes a backup beside the file. All other commands also upgrade an older database when they open it, but
+    First writes a backup beside the file, or of a server's database in results/. All other commands also upgrade an older database when they open it, but
     without a backup.
     """
     from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
@@ -104,7 +104,7 @@ def backup(
 ) -> None:
     """Copy the database to a new file.
 
-    Safe while runs are being computed. Checkpoints, which are separate files, are not copied.
+    A copy of a server's database is made by pg_dump, for pg_restore. Safe while runs are being computed. Checkpoints, which are separate files, are not copied.
     """
     from ssmail.store.maintenance.sqlite_file import back_up
 
@@ -117,7 +117,10 @@ def backup(
 
 @app.command()
 def merge(
-    other: Annotated[str, typer.Argument(metavar="OTHER.db", help="The database to take runs from; it is only read.")],
+    other: Annotated[
+        str,
+        typer.Argument(metavar="OTHER.db", help="The file or URL of the database to take runs from; it is only read."),
+    ],
     as_json: Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
@@ -198,9 +201,10 @@ def _summary(found: "DatabaseInformation") -> list[str]:
     revision = found.revision or "none"
     if found.revision != found.newest_revision:
         revision += f" ({found.newest_revision} is the newest; `ssmail db upgrade`)"
+    free = "" if found.free_bytes is None else f" ({_size(found.free_bytes)} of it free)"
     runs = counted(sum(count.runs for count in found.runs), "run")
     return [
-        f"{found.path}: schema {revision}, {_size(found.size_bytes)} ({_size(found.free_bytes)} of it free), {runs}",
+        f"{found.path}: schema {revision}, {_size(found.size_bytes)}{free}, {runs}",
         f"{counted(found.metrics, 'value')} of metrics; {counted(found.arrays, 'array')}, {_size(found.array_bytes)} "
         f"({100 * found.array_share:.0f} % of the size); {counted(found.artifacts, 'checkpoint file')}",
     ]

@@ -10,6 +10,8 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
+from sqlalchemy import URL
+
 from ssmail.config.foreign_files import IrregularFileError, open_regular
 from ssmail.errors import InputError
 from ssmail.store.queries import ArtifactRow
@@ -28,6 +30,12 @@ MOST_FILES = 16  # of a run; ssmail writes two
 def checkpoint_root_of(database: Path) -> Path:
     """Return the checkpoint folder of an SQLite file."""
     return database.parent / "checkpoints"
+
+
+def checkpoint_root(url: URL) -> Path:
+    """Return the checkpoint folder of a database: beside an SQLite file; below the current folder for a server."""
+    on_sqlite = url.get_backend_name() == "sqlite"
+    return checkpoint_root_of(Path(str(url.database)) if on_sqlite else Path("results/ssmail.db").absolute())
 
 
 def run_folder(root: Path, run_id: str) -> Path:

@@ -1,28 +1,29 @@
 """Engines for databases of the current schema, and their read and write transactions.
 
 SQLite runs in WAL mode, so readers never wait. Writers take turns: each write transaction starts with BEGIN IMMEDIATE,
-which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock.
+which waits up to BUSY_SECONDS for the write lock, so that no later statement of the transaction meets a lock. On a
+server (see `server`), `read` and `write` do their work again after a conflict or a lost connection.
 """
 
 import os
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, make_url, select, table, text
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
-from ssmail.config.foreign_files import open_regular
 from ssmail.errors import InputError, SsmailError, masked, shortened
+from ssmail.store import server
+from ssmail.store.foreign_sqlite import refuse_journal, refuse_other_tables, refuse_program
 from ssmail.store.schema import REVISIONS, metadata
 
 BUSY_SECONDS = 120.0
 DRIVER_ERRORS = (DBAPIError, sqlite3.Error, UnicodeDecodeError)
 """What using a database raises; a UnicodeDecodeError about a damaged name in the schema, or SQLite's message on it."""
-_JOURNAL = bytes.fromhex("d9d505f920a163d7")  # how a journal ends that names another file (SQLite's file format)
 BACKENDS = ("sqlite", "postgresql")
 DRIVERS = (
     "sqlite",
@@ -31,11 +32,14 @@ DRIVERS = (
     *(f"postgresql+{name}" for name in ("psycopg", "psycopg2", "pg8000")),
 )
 _MIGRATIONS = Path(__file__).parent / "migrations"
+_READS: dict[str, Any] = {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
+T = TypeVar("T")
 
 
-def connect(where: str | Path) -> Engine:
+def connect(where: str | Path, patience: float = 0.0) -> Engine:
     """Return an engine for the database at `where` (a path or an SQLAlchemy URL); create or upgrade it if necessary.
 
+    patience: how many seconds to wait for a server that cannot be reached; one that is starting is always waited for.
     Raises InputError when the database cannot be created or read, is not an ssmail database, or has a newer schema.
     """
     url = as_url(where)
@@ -50,14 +54,12 @@ def connect(where: str | Path) -> Engine:
     try:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
-        raise InputError(
-            f"no driver for the database URL {name_of(url)} is installed ({error}); install it with pip"
-        ) from error
+        raise server.missing_driver(url, name_of(url)) from error
     try:
-        with explained_errors(describe(engine)):
-            with engine.connect() as connection:
-                revision = revision_of(connection, engine)
-            if revision != REVISIONS[-1]:
+        passes = server.passes if patience else server.is_coming
+        revision = _attempts(engine, lambda _: _revision(engine), patience or BUSY_SECONDS, passes)
+        if revision != REVISIONS[-1]:
+            with explained_errors(describe(engine)):
                 _upgrade(engine)
     except SsmailError:
         engine.dispose()
@@ -66,19 +68,89 @@ def connect(where: str | Path) -> Engine:
 
 
 @contextmanager
-def reading(engine: Engine) -> Iterator[Connection]:
-    """Yield a connection that reads one consistent state of the database; never waits for a writer."""
-    with explained_errors(describe(engine)), engine.connect() as connection:
+def reading(engine: Engine, patience: float | None = None) -> Iterator[Connection]:
+    """Yield a connection that reads one consistent state of the database; never waits for a writer.
+
+    Waits `patience` seconds, by default BUSY_SECONDS, for a server that cannot be reached, but raises SsmailError if it
+    is lost during the block; `read` does not.
+    """
+    with explained_errors(describe(engine)), _connected(engine, patience) as connection:
         yield connection
 
 
 @contextmanager
 def writing(engine: Engine) -> Iterator[Connection]:
-    """Yield a connection in a write transaction. Waits for the write lock and holds it until the block ends."""
-    with explained_errors(describe(engine)), engine.connect() as connection:
-        connection = connection.execution_options(writes=True)
-        with connection.begin():
-            yield connection
+    """Yield a connection in a write transaction. Waits for the write lock and holds it until the block ends.
+
+    The block is left with an SsmailError after a conflict, or if a server is lost; `write` does its work again.
+    """
+    with explained_errors(describe(engine)), _transaction(engine) as connection:
+        yield connection
+
+
+def read(engine: Engine, work: Callable[[Connection], T]) -> T:
+    """Return what `work` reads from one consistent state; on a server, from a new one if the connection is lost."""
+
+    def attempt(_again: bool) -> T:
+        with _connection(engine, reads=True) as connection:
+            return work(connection)
+
+    return _attempts(engine, attempt, BUSY_SECONDS)
+
+
+def write(engine: Engine, work: Callable[[Connection, bool], T], patience: float | None = None) -> T:
+    """Return what `work` returns, after committing what it wrote in a write transaction of its own.
+
+    On a server, `work` is done again after a conflict with another transaction or a lost connection, for `patience`
+    seconds, by default BUSY_SECONDS. Its second argument is then True: the attempt before may have been committed, if
+    only the answer was lost, so `work` must recognize what it wrote.
+    """
+
+    def attempt(again: bool) -> T:
+        with _transaction(engine) as connection:
+            return work(connection, again)
+
+    return _attempts(engine, attempt, BUSY_SECONDS if patience is None else patience)
+
+
+def _attempts(
+    engine: Engine,
+    attempt: Callable[[bool], T],
+    patience: float,
+    passes: Callable[[DBAPIError], bool] = server.passes,
+) -> T:
+    """Return what `attempt(False)` returns, or on a server `attempt(True)` after an error that passes."""
+    with explained_errors(describe(engine)):
+        pauses, again = server.delays(patience), False
+        while True:
+            try:
+                return attempt(again)
+            except DBAPIError as error:
+                if engine.dialect.name == "sqlite" or not passes(error) or next(pauses, None) is None:
+                    raise
+            again = True
+
+
+def _connected(engine: Engine, patience: float | None) -> Connection:
+    """Return a connection to read from, as soon as the server can be reached."""
+    seconds = BUSY_SECONDS if patience is None else patience
+    return _attempts(engine, lambda _: _connection(engine, reads=True), seconds)
+
+
+def _connection(engine: Engine, reads: bool = False) -> Connection:
+    connection = engine.connect()  # asks a server whether it is still there, and connects again if not
+    return connection.execution_options(**_READS) if reads and engine.dialect.name != "sqlite" else connection
+
+
+@contextmanager
+def _transaction(engine: Engine) -> Iterator[Connection]:
+    with _connection(engine).execution_options(writes=True) as connection, connection.begin():
+        yield connection
+
+
+def _revision(engine: Engine) -> str | None:
+    with _connection(engine) as connection:
+        return revision_of(connection, engine)
 
 
 def describe(engine: Engine) -> str:
@@ -103,7 +175,7 @@ def as_url(where: str | Path) -> URL:
             f"{shortened(url.drivername, 60)} is no database that ssmail knows; use {' or '.join(BACKENDS)}"
         )
     if url.get_backend_name() != "sqlite":
-        return url
+        return server.with_driver(url)
     if url.database in (None, "", ":memory:") or str(url.database).startswith("file:"):
         raise InputError(
             f"{shortened(masked(where), 100)} is not a file on disk, which ssmail needs; give the path of a file"
@@ -114,8 +186,9 @@ def as_url(where: str | Path) -> URL:
 def make_engine(url: URL) -> Engine:
     """Return an engine with ssmail's settings, without checking or upgrading the database."""
     if url.get_backend_name() != "sqlite":
-        return create_engine(url, isolation_level="SERIALIZABLE")
-    _refuse_journal(Path(os.path.realpath(str(url.database))))  # SQLite looks beside the file behind a link
+        found = server.arguments(url, BUSY_SECONDS)
+        return create_engine(url, isolation_level="READ COMMITTED", pool_pre_ping=True, connect_args=found)
+    refuse_journal(Path(os.path.realpath(str(url.database))))  # SQLite looks beside the file behind a link
     engine = create_engine(url, connect_args={"timeout": BUSY_SECONDS, "check_same_thread": False})
 
     @event.listens_for(engine, "connect")
@@ -139,13 +212,13 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
     Raises InputError for a database of another program or of a newer ssmail.
     """
     if engine.dialect.name == "sqlite":
-        _refuse_program(connection, describe(engine))
+        refuse_program(connection, describe(engine))
     tables = set(inspect(connection).get_table_names())
     if not tables:
         return None
     version_table = "alembic_version"
     if version_table not in tables or not tables & set(metadata.tables):
-        raise InputError(f"{describe(engine)} is a database of another program; give ssmail its own file")
+        raise InputError(f"{describe(engine)} is a database of another program; give ssmail its own database")
     revision = connection.execute(select(text("version_num")).select_from(table(version_table))).scalar()
     if revision not in REVISIONS:
         raise InputError(
@@ -153,58 +226,13 @@ def revision_of(connection: Connection, engine: Engine) -> str | None:
             f"to {REVISIONS[-1]}); upgrade ssmail or use another database"
         )
     if engine.dialect.name == "sqlite":
-        _refuse_other_tables(connection, describe(engine))
+        refuse_other_tables(connection, describe(engine))
     return str(revision)
-
-
-def _refuse_program(connection: Connection, where: str) -> None:
-    """Raise InputError if an SQLite file computes anything when it is read or written.
-
-    That is a view or a virtual table in place of a table, a trigger, or a generated column; ssmail makes none of them.
-    """
-    objects = "SELECT name FROM sqlite_master WHERE type NOT IN ('table', 'index') OR rootpage = 0"
-    columns = (
-        "SELECT m.name FROM sqlite_master AS m, pragma_table_xinfo(m.name) AS c WHERE m.type = 'table' AND c.hidden"
-    )
-    found = connection.exec_driver_sql(f"{objects} UNION ALL {columns} LIMIT 1").scalar()
-    if found is not None:
-        raise InputError(
-            f"{where} holds {str(found)!r:.40}, a view, trigger or computed column, which ssmail never makes; do not "
-            "use this file"
-        )
-
-
-def _refuse_journal(file: Path) -> None:
-    """Raise InputError if a rollback journal names another file, which SQLite may delete when it rolls back.
-
-    It does so in transactions over several databases, of which ssmail has none.
-    """
-    try:
-        with open_regular(file.with_name(f"{file.name}-journal")) as journal:
-            journal.seek(-min(len(_JOURNAL), os.fstat(journal.fileno()).st_size), os.SEEK_END)
-            names_another = journal.read(len(_JOURNAL)) == _JOURNAL
-    except FileNotFoundError:
-        return
-    except OSError:
-        names_another = True
-    if names_another:
-        raise InputError(f"{file}-journal is not a journal that ssmail leaves behind; do not use these two files")
 
 
 def _text(content: bytes) -> str:
     """Return a stored text, with surrogates for what is not UTF-8: one such text must not hide all other rows."""
     return content.decode(errors="surrogateescape")
-
-
-def _refuse_other_tables(connection: Connection, where: str) -> None:
-    """Raise InputError unless the tables of an SQLite file have the columns and primary keys of the schema."""
-    columns = "SELECT m.name, c.name, c.pk > 0 FROM sqlite_master AS m, pragma_table_info(m.name) AS c"
-    found = {tuple(row) for row in connection.exec_driver_sql(f"{columns} WHERE m.type = 'table'")}
-    for name, wanted in metadata.tables.items():
-        if {row for row in found if row[0] == name} != {(name, item.name, item.primary_key) for item in wanted.columns}:
-            raise InputError(
-                f"the table {name} of {where} does not have the columns that ssmail gives it; use a backup of the file"
-            )
 
 
 @contextmanager
@@ -218,7 +246,10 @@ def explained_errors(where: str) -> Iterator[None]:
 
 def explained(error: Exception, where: str) -> SsmailError:
     """Return the error that says in one sentence what one of DRIVER_ERRORS means for the user."""
-    reason = str(error.orig if isinstance(error, DBAPIError) else error)
+    orig = error.orig if isinstance(error, DBAPIError) else error
+    if isinstance(error, DBAPIError) and not isinstance(orig, sqlite3.Error):
+        return server.explained(error, where)
+    reason = str(orig)
     if isinstance(error, UnicodeDecodeError):
         reason = "malformed text"
     if "not a database" in reason or "malformed" in reason:
@@ -237,6 +268,8 @@ def name_of(url: URL) -> str:
     """Return the path of an SQLite database, or the URL of another without passwords, for messages."""
     if url.get_backend_name() == "sqlite" and url.database:
         return url.database
+    if url.drivername == f"postgresql+{server.DRIVER}":
+        url = url.set(drivername="postgresql")
     return masked(url.render_as_string(hide_password=True))
 
 
@@ -263,6 +296,7 @@ def _upgrade(engine: Engine) -> None:
     config = Config()
     config.set_main_option("script_location", str(_MIGRATIONS).replace("%", "%%"))
     with writing(engine) as connection:
+        server.lock_schema(connection)
         config.attributes["connection"] = connection
         revision = revision_of(connection, engine)
         if revision is None:

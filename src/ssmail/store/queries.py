@@ -15,7 +15,7 @@ from ssmail.config.changes import changes, with_changes
 from ssmail.config.spec import with_added_keys
 from ssmail.errors import InputError
 from ssmail.store import schema
-from ssmail.store.schema import RunState
+from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, UnsoundError, raw, sound
 
 HEARTBEAT_SECONDS = 5.0
@@ -111,9 +111,16 @@ class ArtifactRow:
     size_bytes: int
 
 
-def runs(connection: Connection, *conditions: Any, damaged: set[DamagedRow] | None = None) -> list[RunRow]:
-    """Return the runs that meet all conditions, newest last, without damaged rows, which are added to `damaged`."""
+def runs(
+    connection: Connection, *conditions: Any, damaged: set[DamagedRow] | None = None, for_update: bool = False
+) -> list[RunRow]:
+    """Return the runs that meet all conditions, newest last, without damaged rows, which are added to `damaged`.
+
+    for_update: on a server, nobody else changes the rows until the transaction ends; in SQLite it is so anyway.
+    """
     query = select(*raw(schema.run)).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
+    if for_update:
+        query = query.with_for_update()
     return [RunRow(**values) for values in sound_rows(connection, schema.run, query, damaged)]
 
 
@@ -134,14 +141,14 @@ def rows_of(
     connection: Connection, table: Table, run_id: str, damaged: set[DamagedRow] | None = None
 ) -> Iterator[dict[str, Any]]:
     """Yield what the run recorded in a table, by name; add damaged rows to `damaged` instead."""
-    query = select(*raw(table)).where(table.c.run_id == run_id).order_by(table.c.name)
+    query = select(*raw(table)).where(table.c.run_id == run_id).order_by(in_byte_order(table.c.name))
     yield from sound_rows(connection, table, query, damaged)
 
 
-def one_run(connection: Connection, run_id: str) -> RunRow:
+def one_run(connection: Connection, run_id: str, *, for_update: bool = False) -> RunRow:
     """Return the run with that full id. Raises InputError when there is none."""
     damaged: set[DamagedRow] = set()
-    found = runs(connection, schema.run.c.id == run_id, damaged=damaged)
+    found = runs(connection, schema.run.c.id == run_id, damaged=damaged, for_update=for_update)
     refuse(damaged)
     if not found:
         raise InputError(f"there is no run {run_id[:8]} in the database; `ssmail runs list` shows the stored runs")
@@ -154,17 +161,20 @@ def refuse(damaged: Iterable[DamagedRow]) -> None:
         raise InputError(f"run {row.run} is damaged ({row.place}{row.reason}); `ssmail db check` shows what to do")
 
 
-def silent_runs(connection: Connection, stale_seconds: float = STALE_SECONDS) -> list[RunRow]:
+def silent_runs(
+    connection: Connection, stale_seconds: float = STALE_SECONDS, *, for_update: bool = False
+) -> list[RunRow]:
     """Return the RUNNING runs that are not alive (see RunRow.is_alive)."""
     now, stale = datetime.now(UTC), timedelta(seconds=stale_seconds)
     heartbeat = schema.run.c.heartbeat
     silent = (heartbeat < now - stale) | (heartbeat > now + stale)
-    return runs(connection, schema.run.c.state == RunState.RUNNING, silent)
+    return runs(connection, schema.run.c.state == RunState.RUNNING, silent, for_update=for_update)
 
 
-def newest_of_cell(connection: Connection, spec_hash: str, seed: int) -> RunRow | None:
+def newest_of_cell(connection: Connection, spec_hash: str, seed: int, *, for_update: bool = False) -> RunRow | None:
     """Return the newest run of the cell, or None."""
-    found = runs(connection, schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
+    cell = (schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
+    found = runs(connection, *cell, for_update=for_update)
     return found[-1] if found else None
 
 

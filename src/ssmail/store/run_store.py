@@ -8,17 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
+from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, shortened
-from ssmail.store import arrays, queries, run_metadata, schema
-from ssmail.store.checkpoint_files import checkpoint_root_of, remove_run_folder
-from ssmail.store.connection import connect, describe, reading, writing
+from ssmail.store import arrays, queries, run_metadata, schema, server
+from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
+from ssmail.store.connection import connect, describe, read, reading, write
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
-from ssmail.store.schema import RunState
+from ssmail.store.schema import RunState, in_byte_order, require_fitting
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
-from ssmail.store.writer import RunWriter
+from ssmail.store.writer import RunWriter, drop_metrics_after, end, interrupt
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,19 +38,18 @@ class Store:
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
         self.stale_seconds = stale_seconds
-        on_sqlite = engine.dialect.name == "sqlite"
-        file = Path(str(engine.url.database)) if on_sqlite else Path("results/ssmail.db").absolute()
-        self.checkpoint_root = checkpoint_root_of(file)
+        self.checkpoint_root = checkpoint_root(engine.url)
         self.damaged: set[DamagedRow] = set()
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
-    def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS) -> Self:
+    def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS, patience: float = 0.0) -> Self:
         """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
+        patience: how many seconds to wait for a server that cannot be reached.
         Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        return cls(connect(where), stale_seconds)
+        return cls(connect(where, patience), stale_seconds)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -74,11 +73,13 @@ class Store:
         run = schema.run
         equal = {run.c.method: method, run.c.environment: environment, run.c.profile: profile, run.c.state: state}
         conditions = [column == value for column, value in equal.items() if value is not None]
-        with reading(self._engine) as connection:
-            if ids is not None:
-                conditions.append(run.c.id.in_(queries.resolve(connection, ids)))
-            damaged: set[DamagedRow] = set()
-            found = queries.runs(connection, *conditions, damaged=damaged)
+        damaged: set[DamagedRow] = set()
+
+        def find(connection: Connection) -> list[RunRow]:
+            wanted = () if ids is None else (run.c.id.in_(queries.resolve(connection, ids)),)
+            return queries.runs(connection, *conditions, *wanted, damaged=damaged)
+
+        found = read(self._engine, find)
         if ids is not None:
             queries.refuse(damaged)
         self.damaged |= damaged
@@ -89,8 +90,7 @@ class Store:
 
         Raises InputError for one that is unknown or ambiguous.
         """
-        with reading(self._engine) as connection:
-            return list(dict.fromkeys(queries.resolve(connection, ids)))
+        return list(dict.fromkeys(read(self._engine, lambda connection: queries.resolve(connection, ids))))
 
     def only(self, run_ids: Iterable[str]) -> Self:
         """Return the same store, except that its `runs` are among these (full ids); both use the same connections."""
@@ -108,15 +108,13 @@ class Store:
             return []
         wanted = set(run_ids)
         try:
-            with reading(self._engine) as connection:
-                return [row for row in queries.runs(connection) if row.id in wanted]
+            return [row for row in read(self._engine, queries.runs) if row.id in wanted]
         except SsmailError:
             return []
 
     def find_cell(self, spec_hash: str, seed: int) -> RunRow | None:
         """Return the newest run of the cell, or None."""
-        with reading(self._engine) as connection:
-            return queries.newest_of_cell(connection, spec_hash, seed)
+        return read(self._engine, lambda connection: queries.newest_of_cell(connection, spec_hash, seed))
 
     def is_alive(self, row: RunRow) -> bool:
         """Return whether a process is computing the run: it is RUNNING and has sent a heartbeat recently."""
@@ -141,38 +139,43 @@ class Store:
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the
         cell, or when the cell has finished or diverged already, unless `repeat` allows a new run beside the old one.
         """
-        run_id, owner, metadata = uuid.uuid4().hex, uuid.uuid4().hex, run_metadata.columns()
-        with writing(self._engine) as connection:
-            newest = queries.newest_of_cell(connection, spec.hash(), seed)
+        run_id, owner = uuid.uuid4().hex, uuid.uuid4().hex
+        row = {
+            "id": run_id,
+            "method": spec.method,
+            "environment": spec.environment,
+            "profile": spec.profile,
+            "seed": seed,
+            "spec_json": spec.as_json(),
+            "spec_hash": spec.hash(),
+            "dataset_hash": dataset_hash,
+            "state": RunState.RUNNING,
+            "owner": owner,
+            "resumes": 0,
+            "device": device,
+            "wall_seconds": 0.0,
+            "cpu_seconds": 0.0,
+            **run_metadata.columns(),
+        }
+        require_fitting(schema.run, [row])
+
+        def start(connection: Connection, again: bool) -> None:
+            server.lock_cells(connection)
+            newest = queries.newest_of_cell(connection, spec.hash(), seed, for_update=True)
             if newest is not None:
+                if again and newest.id == run_id:
+                    return
                 self.require_idle(newest)
                 if newest.state.settled and not repeat:
                     raise InputError(
                         f"seed {seed} of this spec has {newest.state} already, as run {newest.name}; delete it first"
                     )
                 if newest.state is RunState.RUNNING:
-                    _interrupt(connection, newest)
+                    interrupt(connection, newest)
             now = datetime.now(UTC)
-            row = {
-                "id": run_id,
-                "method": spec.method,
-                "environment": spec.environment,
-                "profile": spec.profile,
-                "seed": seed,
-                "spec_json": spec.as_json(),
-                "spec_hash": spec.hash(),
-                "dataset_hash": dataset_hash,
-                "state": RunState.RUNNING,
-                "started": now,
-                "heartbeat": now,
-                "owner": owner,
-                "resumes": 0,
-                "device": device,
-                "wall_seconds": 0.0,
-                "cpu_seconds": 0.0,
-                **metadata,
-            }
-            connection.execute(insert(schema.run), row)
+            connection.execute(insert(schema.run), {**row, "started": now, "heartbeat": now})
+
+        write(self._engine, start)
         return RunWriter(self._engine, self.checkpoint_root, run_id, owner)
 
     def resume_run(self, run_id: str, from_step: int) -> RunWriter:
@@ -182,13 +185,16 @@ class Store:
         or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
         `from_step`.
         """
-        owner, metadata = uuid.uuid4().hex, run_metadata.columns()
-        with writing(self._engine) as connection:
-            row = queries.one_run(connection, run_id)
+        owner = uuid.uuid4().hex
+
+        def resume(connection: Connection, again: bool) -> RunRow:
+            row = queries.one_run(connection, run_id, for_update=True)
+            if again and row.owner == owner:
+                return row
             self.require_idle(row)
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
-            _drop_metrics_after(connection, row, from_step)
+            drop_metrics_after(connection, row, from_step)
             changes = {
                 "state": RunState.RUNNING,
                 "error": None,
@@ -196,23 +202,28 @@ class Store:
                 "heartbeat": datetime.now(UTC),
                 "owner": owner,
                 "resumes": row.resumes + 1,
-                **metadata,
+                **run_metadata.columns(),
             }
             connection.execute(update(schema.run).where(schema.run.c.id == run_id).values(changes))
+            return row
+
+        row = write(self._engine, resume)
         return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row)
 
     def mark_stale(self) -> list[RunRow]:
         """Mark the RUNNING runs without a recent heartbeat as INTERRUPTED; return their rows from before the change."""
-        with writing(self._engine) as connection:
-            found = queries.silent_runs(connection, self.stale_seconds)
+
+        def mark(connection: Connection, _again: bool) -> list[RunRow]:
+            found = queries.silent_runs(connection, self.stale_seconds, for_update=True)
             for row in found:
-                _interrupt(connection, row)
-        return found
+                interrupt(connection, row)
+            return found
+
+        return write(self._engine, mark)
 
     def end_dead_run(self, run_id: str, state: RunState, error: str) -> None:
         """Set the state of a RUNNING run whose process is known to be dead; leave a run in any other state alone."""
-        with writing(self._engine) as connection:
-            _end(connection, run_id, state, error)
+        write(self._engine, lambda connection, _: end(connection, run_id, state, error))
 
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
@@ -220,11 +231,15 @@ class Store:
         Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed. A damaged
         run is deleted too, whatever it says of its process.
         """
-        with writing(self._engine) as connection:
-            full = queries.resolve(connection, run_ids)
-            for row in queries.runs(connection, schema.run.c.id.in_(full)):
+        full: list[str] = []
+
+        def delete_idle(connection: Connection, again: bool) -> None:
+            full[:] = full if again and full else queries.resolve(connection, run_ids)
+            for row in queries.runs(connection, schema.run.c.id.in_(full), for_update=True):
                 self.require_idle(row)
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
+
+        write(self._engine, delete_idle)
         for run_id in filter(schema.is_run_id, full):
             remove_run_folder(self.checkpoint_root, run_id)
 
@@ -250,7 +265,7 @@ class Store:
         query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
         if names is not None:
             query = query.where(table.c.name.in_(list(names)))
-        query = query.order_by(run.c.started, run.c.id, table.c.name, table.c.step)
+        query = query.order_by(run.c.started, run.c.id, in_byte_order(table.c.name), table.c.step)
         columns = ["run_id", "seed", "name", "step", "value"]
         with reading(self._engine) as connection:
             rows = [row for row in connection.execute(query) if self._is_sound(table, *row)]
@@ -291,7 +306,7 @@ class Store:
     def array_names(self, run_id: str) -> list[str]:
         """Return the names of the run's arrays, sorted."""
         table = schema.array
-        query = select(table.c.name).where(table.c.run_id == run_id).order_by(table.c.name)
+        query = select(table.c.name).where(table.c.run_id == run_id).order_by(in_byte_order(table.c.name))
         with reading(self._engine) as connection:
             names = list(connection.execute(query).scalars())
         wrong = {DamagedRow(table.name, run_id, "its name is none", name) for name in names if not is_name(name)}
@@ -300,51 +315,9 @@ class Store:
 
     def artifacts(self, run_id: str) -> list[ArtifactRow]:
         """Return the files that the run recorded, by name."""
-        with reading(self._engine) as connection:
-            return queries.artifacts(connection, run_id, self.checkpoint_root, self.damaged)
+        root = self.checkpoint_root
+        return read(self._engine, lambda connection: queries.artifacts(connection, run_id, root, self.damaged))
 
     def is_compact(self, run: RunRow) -> bool:
         """Return whether a run that ended has no checkpoint: a compact database keeps only what figures read of it."""
         return run.state.settled and not self.artifacts(run.id)
-
-
-def _interrupt(connection: Connection, row: RunRow) -> None:
-    """Mark a run whose process is silent as INTERRUPTED."""
-    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
-    ahead = row.silent_seconds < 0
-    error = (
-        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
-    )
-    _end(connection, row.id, RunState.INTERRUPTED, error)
-
-
-def _end(connection: Connection, run_id: str, state: RunState, error: str) -> None:
-    running = (schema.run.c.id == run_id) & (schema.run.c.state == RunState.RUNNING)
-    values = {"state": state, "error": error, "finished": datetime.now(UTC)}
-    connection.execute(update(schema.run).where(running).values(values))
-
-
-def _drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:
-    """Delete the run's metrics after `step` and rebuild metric_latest.
-
-    Raises SsmailError when the run has recorded fewer steps.
-    """
-    metric, latest = schema.metric, schema.metric_latest
-    connection.execute(delete(metric).where(metric.c.run_id == row.id, metric.c.step > step))
-    last = queries.last_step(connection, row.id)
-    if last < step:
-        raise SsmailError(
-            f"the checkpoint of run {row.name} is at epoch {step} but the database ends at epoch {last}; "
-            "delete the run and train it again"
-        )
-    connection.execute(delete(latest).where(latest.c.run_id == row.id))
-    newest = (
-        select(metric.c.name, func.max(metric.c.step).label("step"))
-        .where(metric.c.run_id == row.id)
-        .group_by(metric.c.name)
-        .subquery()
-    )
-    same = (metric.c.name == newest.c.name) & (metric.c.step == newest.c.step)
-    columns = ["run_id", "name", "step", "value", "kind"]
-    rows = select(*(metric.c[column] for column in columns)).join(newest, same).where(metric.c.run_id == row.id)
-    connection.execute(insert(latest).from_select(columns, rows))

@@ -1,12 +1,17 @@
 """The tables of the store; docs/database.md explains each column. Every change here needs an Alembic revision."""
 
 import re
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeDecorator
+
+from ssmail.errors import InputError, shortened
 
 REVISIONS = ("0001",)
 """All schema revisions that this version of ssmail knows, oldest first; it reads and writes the last one."""
@@ -134,3 +139,40 @@ artifact = sa.Table(
     sa.Column("sha256", sa.String(64), nullable=False),
     sa.Column("size_bytes", sa.BigInteger, nullable=False),
 )
+
+
+class in_byte_order(FunctionElement[str]):  # noqa: N801 (a function to its callers)
+    """A text column to order by: in the order of its bytes on every database, as in SQLite and Python."""
+
+    inherit_cache = True
+
+
+@compiles(in_byte_order)
+def _plain(element: Any, compiler: Any, **options: Any) -> str:
+    return str(compiler.process(element.clauses, **options))
+
+
+@compiles(in_byte_order, "postgresql")
+def _collated(element: Any, compiler: Any, **options: Any) -> str:
+    return f'{compiler.process(element.clauses, **options)} COLLATE "C"'
+
+
+def require_fitting(table: sa.Table, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Raise InputError if a text is longer than its column, which SQLite would accept and a server would refuse."""
+    for row in rows:
+        if fault := length_fault(table, row):
+            raise InputError(f"{fault}; give a shorter one")
+
+
+def length_fault(table: sa.Table, row: Mapping[str, Any]) -> str | None:
+    """Return which text of a row is longer than its column, or cannot be stored on a server; None if all fit."""
+    for column in table.c:
+        value, longest = row.get(column.name), getattr(column.type, "length", None)
+        if not isinstance(value, str):
+            continue
+        if longest is not None and len(value) > longest:
+            named = f"{column.name} {shortened(value, 40)!r} has {len(value)} characters"
+            return f"the {table.name}'s {named}, of which the database keeps {longest}"
+        if "\0" in value:
+            return f"the {table.name}'s {column.name} {shortened(value, 40)!r} has a null character"
+    return None

@@ -2,6 +2,7 @@
 
 Each transaction first updates the run's row, and continues only if the run is RUNNING and this writer still owns it. So
 a finished run cannot change, and a process that was declared dead cannot write into a run that another one resumed.
+The transactions of an epoch and of the end of a run recognize what they wrote if the answer to their commit was lost.
 """
 
 import hashlib
@@ -13,15 +14,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
+from sqlalchemy import Connection, Engine, Table, delete, func, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ssmail.errors import SsmailError
-from ssmail.store import arrays, run_metadata, schema
+from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import run_folder
-from ssmail.store.connection import writing
+from ssmail.store.connection import write
 from ssmail.store.queries import RunRow
-from ssmail.store.schema import RunState
+from ssmail.store.schema import RunState, require_fitting
 
 
 class RunWriter:
@@ -45,30 +46,37 @@ class RunWriter:
 
     def epoch(self, step: int, metrics: Mapping[str, float]) -> None:
         """Record the metrics of epoch `step` (1-based). Raises SsmailError when the epoch has metrics already."""
-        with writing(self._engine) as connection:
+
+        def record(connection: Connection, again: bool) -> None:
             self._touch(connection)
+            if again and self._has(connection, step, metrics):
+                return
             try:
                 _insert(connection, schema.metric, self.run_id, step, metrics)
             except IntegrityError as error:
                 raise SsmailError(f"run {self.run_id[:8]} already has metrics for step {step}") from error
             self._replace_latest(connection, step, metrics)
 
+        write(self._engine, record)
+
     def final(self, step: int, metrics: Mapping[str, float]) -> None:
         """Record the metrics of the final evaluation, replacing those of an interrupted evaluation."""
-        with writing(self._engine) as connection:
+
+        def record(connection: Connection, _again: bool) -> None:
             self._touch(connection)
             _delete(connection, schema.metric, self.run_id, list(metrics))
             _insert(connection, schema.metric, self.run_id, step, metrics)
             self._replace_latest(connection, step, metrics)
+
+        write(self._engine, record)
 
     def share(self, runs: int) -> None:
         """From now on, count time as that of `runs` runs which this process trains at once."""
         self._used, self._since, self._runs = self._seconds(), (time.monotonic(), time.process_time()), runs
 
     def heartbeat(self) -> None:
-        """Record that this run is alive. Safe to call from another thread."""
-        with writing(self._engine) as connection:
-            self._touch(connection)
+        """Record that this run is alive. Safe to call from another thread. Does not wait for a lost server."""
+        write(self._engine, lambda connection, _: self._touch(connection), patience=0)
 
     def arrays(self, values: Mapping[str, npt.NDArray[Any]]) -> None:
         """Store the arrays by name, replacing existing arrays of the same name."""
@@ -86,8 +94,15 @@ class RunWriter:
         """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards."""
         if state in (RunState.QUEUED, RunState.RUNNING):
             raise SsmailError(f"a run cannot end in the state {state}")
-        with writing(self._engine) as connection:
-            self._touch(connection, state=state, error=error, finished=datetime.now(UTC))
+        error = error and error.replace("\0", "\\0")  # which a server does not store
+
+        def end(connection: Connection, again: bool) -> None:
+            mine = (schema.run.c.id == self.run_id) & (schema.run.c.owner == self._owner)
+            stored = connection.execute(select(schema.run.c.state).where(mine)).scalar() if again else None
+            if stored != state:
+                self._touch(connection, state=state, error=error, finished=datetime.now(UTC))
+
+        write(self._engine, end)
 
     def _touch(self, connection: Connection, **changes: Any) -> None:
         run = schema.run
@@ -116,11 +131,23 @@ class RunWriter:
         }
 
     def _replace(self, table: Table, rows: list[dict[str, Any]]) -> None:
-        with writing(self._engine) as connection:
+        require_fitting(table, rows)
+
+        def replace(connection: Connection, _again: bool) -> None:
             self._touch(connection)
             _delete(connection, table, self.run_id, [row["name"] for row in rows])
             if rows:
                 connection.execute(insert(table), rows)
+
+        write(self._engine, replace)
+
+    def _has(self, connection: Connection, step: int, metrics: Mapping[str, float]) -> bool:
+        """Return whether exactly these values are stored of the step."""
+        metric = schema.metric
+        query = select(metric.c.name, metric.c.value, metric.c.kind)
+        stored = connection.execute(query.where(metric.c.run_id == self.run_id, metric.c.step == step))
+        rows = ((name, _value(value)) for name, value in metrics.items())
+        return {tuple(row) for row in stored} == {(name, row["value"], row["kind"]) for name, row in rows}
 
     def _replace_latest(self, connection: Connection, step: int, metrics: Mapping[str, float]) -> None:
         _delete(connection, schema.metric_latest, self.run_id, list(metrics))
@@ -133,6 +160,7 @@ def _delete(connection: Connection, table: Table, run_id: str, names: list[str])
 
 def _insert(connection: Connection, table: Table, run_id: str, step: int, metrics: Mapping[str, float]) -> None:
     rows = [{"run_id": run_id, "name": name, "step": step, **_value(value)} for name, value in metrics.items()]
+    require_fitting(table, rows)
     if rows:
         connection.execute(insert(table), rows)
 
@@ -143,3 +171,46 @@ def _value(value: float) -> dict[str, Any]:
     if math.isfinite(number):
         return {"value": number, "kind": "finite"}
     return {"value": None, "kind": "nan" if math.isnan(number) else "inf" if number > 0 else "-inf"}
+
+
+def interrupt(connection: Connection, row: RunRow) -> None:
+    """Mark a run whose process is silent as INTERRUPTED."""
+    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+    ahead = row.silent_seconds < 0
+    error = (
+        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
+    )
+    end(connection, row.id, RunState.INTERRUPTED, error)
+
+
+def end(connection: Connection, run_id: str, state: RunState, error: str) -> None:
+    """End a run whose process is dead or silent; leave one alone that is in another state than RUNNING."""
+    running = (schema.run.c.id == run_id) & (schema.run.c.state == RunState.RUNNING)
+    values = {"state": state, "error": error, "finished": datetime.now(UTC)}
+    connection.execute(update(schema.run).where(running).values(values))
+
+
+def drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:
+    """Delete the run's metrics after `step` and rebuild metric_latest.
+
+    Raises SsmailError when the run has recorded fewer steps.
+    """
+    metric, latest = schema.metric, schema.metric_latest
+    connection.execute(delete(metric).where(metric.c.run_id == row.id, metric.c.step > step))
+    last = queries.last_step(connection, row.id)
+    if last < step:
+        raise SsmailError(
+            f"the checkpoint of run {row.name} is at epoch {step} but the database ends at epoch {last}; "
+            "delete the run and train it again"
+        )
+    connection.execute(delete(latest).where(latest.c.run_id == row.id))
+    newest = (
+        select(metric.c.name, func.max(metric.c.step).label("step"))
+        .where(metric.c.run_id == row.id)
+        .group_by(metric.c.name)
+        .subquery()
+    )
+    same = (metric.c.name == newest.c.name) & (metric.c.step == newest.c.step)
+    columns = ["run_id", "name", "step", "value", "kind"]
+    rows = select(*(metric.c[column] for column in columns)).join(newest, same).where(metric.c.run_id == row.id)
+    connection.execute(insert(latest).from_select(columns, rows))

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sqlalchemy import Connection, select
+from sqlalchemy import URL, Connection, select
 
 from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.store import queries, schema
-from ssmail.store.checkpoint_files import STAGING, checkpoint_root_of, fault_of
-from ssmail.store.connection import DRIVER_ERRORS, explained, revision_of
+from ssmail.store.checkpoint_files import STAGING, checkpoint_root, fault_of
+from ssmail.store.connection import DRIVER_ERRORS, explained, name_of, reading, revision_of
 from ssmail.store.maintenance.sqlite_file import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
@@ -41,15 +41,25 @@ class Problem:
 
 
 def check(where: str | Path) -> list[Problem]:
-    """Return all problems of an SQLite database. Safe while runs are being computed.
+    """Return all problems of a database. Safe while runs are being computed.
 
-    Raises InputError when the file is missing, is not an ssmail database, or is from a newer ssmail.
+    Raises InputError when the database is missing, is not one of ssmail's, or is from a newer ssmail.
     """
-    path = existing(where)
-    folders = _checkpoint_folders(path)  # read before the runs, because a run has its row before its folder
+    url = existing(where)
+    folders = _checkpoint_folders(url)  # read before the runs, because a run has its row before its folder
+    if url.get_backend_name() != "sqlite":
+        with opened(url) as engine, reading(engine, patience=0) as connection:
+            return list(_problems(url, connection, revision_of(connection, engine), folders))
+    path = Path(str(url.database))
     try:
-        with opened(path) as engine, engine.connect() as connection:
-            return list(_problems(path, connection, revision_of(connection, engine), folders))
+        with opened(url) as engine, engine.connect() as connection:
+            revision = revision_of(connection, engine)
+            connection.exec_driver_sql("PRAGMA ignore_check_constraints = ON")  # an id that is none: a damaged row
+            damage = connection.exec_driver_sql(f"PRAGMA integrity_check({_MOST})").scalars().all()
+            if damage != ["ok"]:
+                return [_damage(path, str(line)) for line in damage]
+            orphans = list(_orphans(path, connection)) if revision == REVISIONS[-1] else []
+            return [*orphans, *_problems(url, connection, revision, folders)]
     except DRIVER_ERRORS as error:
         reason = str(getattr(error, "orig", error))
         if "not a database" in reason:
@@ -59,31 +69,27 @@ def check(where: str | Path) -> list[Problem]:
         return [_damage(path, reason)]
 
 
-def _problems(path: Path, connection: Connection, revision: str | None, folders: Sequence[Path]) -> Iterator[Problem]:
-    connection.exec_driver_sql("PRAGMA ignore_check_constraints = ON")  # an id that is none is a damaged row, see below
-    damage = connection.exec_driver_sql(f"PRAGMA integrity_check({_MOST})").scalars().all()
-    if damage != ["ok"]:
-        yield from (_damage(path, str(line)) for line in damage)
-        return
+def _problems(url: URL, connection: Connection, revision: str | None, folders: Sequence[Path]) -> Iterator[Problem]:
+    """Find what any database may have; damaged pages, and rows without a run, are for SQLite files only."""
+    place = name_of(url)
     if revision != REVISIONS[-1]:
-        command = command_line("ssmail", "db", "upgrade", "--db", path)
+        command = command_line("ssmail", "db", "upgrade", "--db", place)
         if revision is None:
             found = "it has no tables yet; the process that created it was stopped before it made them"
             remedy = f"use it as it is, for the next command that opens it makes them, such as `{command}`"
         else:
             found = f"its schema is {revision}, but {REVISIONS[-1]} is current"
             remedy = f"run `{command}`, then check again"
-        yield Problem("schema", path.name, found, remedy)
+        yield Problem("schema", Path(str(url.database)).name, found, remedy)
         return
-    yield from _orphans(path, connection)
     damaged: set[DamagedRow] = set()
     runs = queries.runs(connection, damaged=damaged)
-    yield from (damaged_run(path, row) for row in sorted(damaged, key=repr))
+    yield from (damaged_run(url, row) for row in sorted(damaged, key=repr))
     for run in runs:
         yield from faults_of(connection, run)
     yield from _silent(connection)
-    yield from _checkpoints(path, connection, runs)
-    yield from _stray_folders(path, folders, {run.id for run in runs} | {row.run_id for row in damaged})
+    yield from _checkpoints(url, connection, runs)
+    yield from _stray_folders(url, folders, {run.id for run in runs} | {row.run_id for row in damaged})
 
 
 def _damage(path: Path, reason: str) -> Problem:
@@ -104,14 +110,14 @@ def _orphans(path: Path, connection: Connection) -> Iterator[Problem]:
         yield Problem("orphans", name, f"{found} in the table {name}", remedy)
 
 
-def damaged_run(path: Path, row: DamagedRow) -> Problem:
+def damaged_run(url: URL, row: DamagedRow) -> Problem:
     """Return the problem of a row of the table `run` that no command uses."""
     kind = "spec" if row.reason.startswith("its spec") else "rows"
     found = f"run {row.run} is damaged: {row.reason}"
     if schema.is_run_id(row.run_id):
         return Problem(kind, row.run_id, found, _again(row.run))
     statement = f"PRAGMA foreign_keys = ON; DELETE FROM run WHERE {_NO_ID}"
-    remedy = f"run `{command_line('sqlite3', path, statement)}`, which deletes all such runs"
+    remedy = f"run `{command_line('sqlite3', str(url.database), statement)}`, which deletes all such runs"
     return Problem(kind, row.run, found, remedy)
 
 
@@ -171,36 +177,42 @@ def _silent(connection: Connection) -> Iterator[Problem]:
         yield Problem("stale", run.id, found, remedy)
 
 
-def _checkpoints(path: Path, connection: Connection, runs: Sequence[RunRow]) -> Iterator[Problem]:
+def _checkpoints(url: URL, connection: Connection, runs: Sequence[RunRow]) -> Iterator[Problem]:
     """Check that the recorded files exist with the recorded content; those of a run at work change meanwhile."""
     for run in runs:
         if run.is_alive():
             continue
-        for row in queries.artifacts(connection, run.id, checkpoint_root_of(path)):
+        for row in queries.artifacts(connection, run.id, checkpoint_root(url)):
             if wrong := fault_of(row):
                 again = _again(run.name)
                 remedy = f"copy it from a backup to {row.path}, or {again}" if row.path else again
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 
-def _stray_folders(path: Path, folders: Sequence[Path], here: set[str]) -> Iterator[Problem]:
-    """Find checkpoint folders that belong to no run of this database or of others in the same folder."""
+def _stray_folders(url: URL, folders: Sequence[Path], here: set[str]) -> Iterator[Problem]:
+    """Find checkpoint folders that belong to no run of this database or of files beside them.
+
+    Those of databases on servers are not known here: the remedy says so.
+    """
     strays = [folder for folder in folders if folder.name not in here]
-    neighbours = [file for file in path.parent.iterdir() if file != path and file.is_file()]
+    beside = checkpoint_root(url).parent
+    own = url.database if url.get_backend_name() == "sqlite" else None
+    neighbours = [file for file in beside.iterdir() if str(file) != own and file.is_file()] if strays else []
     known = set().union(*map(_run_ids, neighbours)) if strays else set()
     for folder in strays:
         if folder.name.startswith(STAGING):
-            found = f"{folder} belongs to a merge that is running or was killed"
+            found, unless = f"{folder} belongs to a merge that is running or was killed", ""
         elif folder.name not in known:
             found = f"the checkpoints in {folder} belong to no run"
+            unless = "unless a database on a server has this run, "
         else:
             continue
-        yield Problem("folders", folder.name, found, f"delete the folder: `{command_line('rm', '-r', folder)}`")
+        yield Problem("folders", folder.name, found, f"{unless}delete the folder: `{command_line('rm', '-r', folder)}`")
 
 
-def _checkpoint_folders(path: Path) -> list[Path]:
+def _checkpoint_folders(url: URL) -> list[Path]:
     """Return the folders named after a run id, and the staging folders of merges."""
-    root = checkpoint_root_of(path)
+    root = checkpoint_root(url)
     named = re.compile(rf"[0-9a-f]{{32}}|{re.escape(STAGING)}.*")
     return sorted(folder for folder in root.iterdir() if named.fullmatch(folder.name)) if root.is_dir() else []
 

@@ -10,17 +10,18 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from sqlalchemy import Connection, delete
+import sqlalchemy as sa
+from sqlalchemy import URL, Connection, delete, select
 
 from ssmail.errors import InputError
-from ssmail.store import queries, schema
-from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root_of, fault_of
-from ssmail.store.connection import connect, reading, writing
+from ssmail.store import queries, schema, server
+from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root, fault_of
+from ssmail.store.connection import as_url, connect, name_of, reading, writing
 from ssmail.store.maintenance.checks import Problem, damaged_rows, damaged_run, faults_of
-from ssmail.store.maintenance.run_rows import Difference, amount, copy_run, first_difference
-from ssmail.store.maintenance.sqlite_file import existing, file_of, opened, require_current, revision
+from ssmail.store.maintenance.run_rows import CHILDREN, Difference, amount, copy_run, first_difference
+from ssmail.store.maintenance.sqlite_file import existing, is_missing, opened, place_of, require_current, revision
 from ssmail.store.queries import RunRow
-from ssmail.store.validation import DamagedRow
+from ssmail.store.validation import DamagedRow, raw
 
 
 class Fate(StrEnum):
@@ -53,8 +54,8 @@ class MergedRun:
 class Merge:
     """What a merge did with each run of the other database."""
 
-    target: Path
-    other: Path
+    target: Path | str  # the path of a file; the URL on a server, without the password
+    other: Path | str
     runs: tuple[MergedRun, ...]
     without_checkpoints: tuple[str, ...]  # ids of copied runs whose recorded files are not all there
     damaged: tuple[Problem, ...]  # what is wrong with the runs that were left out for it, one problem of each
@@ -73,17 +74,17 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     """Merge the runs of the database `other`, which is only read, into the one at `where`; create it if necessary.
 
     Runs with damaged rows are left out. The merge is one transaction: if it fails, or the process dies at any moment,
-    the target keeps its contents. Raises InputError when a file cannot be used, when both are the same file, or when
+    the target keeps its contents. Raises InputError when a database cannot be used, when both are the same one, or when
     one has another schema.
     """
-    source, target = existing(other), file_of(where)
-    if target.exists() and source.samefile(target):
-        raise InputError(f"{source} is the database itself; give another one to merge into it")
+    source, target = existing(other), as_url(where)
+    if _is_same(source, target):
+        raise InputError(f"{name_of(source)} is the database itself; give another one to merge into it")
     require_current(source)
-    if target.exists() and revision(target) is not None:
+    if not is_missing(target) and revision(target) is not None:
         require_current(target)
-    connect(target).dispose()  # creates the file, its folder and its tables, or waits for the process that does so
-    copies = CheckpointCopies(checkpoint_root_of(source), checkpoint_root_of(target))
+    connect(where).dispose()  # creates the file, its folder and its tables, or waits for the process that does so
+    copies = CheckpointCopies(checkpoint_root(source), checkpoint_root(target))
     try:
         merged, damaged = _merge(source, target, copies)
         # after the transaction: exchange the checkpoints of runs that the target had before
@@ -99,10 +100,19 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     with opened(target) as engine, reading(engine) as connection:
         files = {run_id: queries.artifacts(connection, run_id, copies.target) for run_id in entered}
     incomplete = tuple(run_id for run_id, rows in files.items() if any(fault_of(row) for row in rows))
-    return Merge(target, source, tuple(merged), incomplete, damaged)
+    return Merge(place_of(target), place_of(source), tuple(merged), incomplete, damaged)
 
 
-def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[MergedRun], tuple[Problem, ...]]:
+def _is_same(source: URL, target: URL) -> bool:
+    """Return whether the two are one database. On servers it may have several URLs; all runs are there already then."""
+    if is_missing(target) or target.get_backend_name() != source.get_backend_name():
+        return False
+    if target.get_backend_name() == "sqlite":
+        return Path(str(source.database)).samefile(str(target.database))
+    return source == target
+
+
+def _merge(source: URL, target: URL, copies: CheckpointCopies) -> tuple[list[MergedRun], tuple[Problem, ...]]:
     """Copy the checkpoints before locking the target; then decide again, and write in one transaction."""
     with opened(source) as theirs, opened(target) as ours:
         with reading(theirs) as there, reading(ours) as here:
@@ -110,6 +120,7 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[M
             merged = _leave_out(decide_fates(here, there, damaged), there, damaged)
             copies.stage(_wanted_folders(merged, here, copies))
         with reading(theirs) as there, writing(ours) as here:
+            server.lock_runs(here)
             merged = decide_fates(here, there, damaged)
             copies.stage(item.run.id for item in merged if item.enters and item.run.state.settled)
             before = {run.id for run in queries.runs(here)}
@@ -123,7 +134,7 @@ def _merge(source: Path, target: Path, copies: CheckpointCopies) -> tuple[list[M
     return merged, tuple(damaged.values())
 
 
-def _damaged(source: Path, here: Connection, there: Connection) -> dict[str, Problem]:
+def _damaged(source: URL, here: Connection, there: Connection) -> dict[str, Problem]:
     """Return a problem of each run of `there` that cannot be copied, by its id or what is shown of it."""
     rows: set[DamagedRow] = set()
     blocking: set[DamagedRow] = set()
@@ -136,7 +147,20 @@ def _damaged(source: Path, here: Connection, there: Connection) -> dict[str, Pro
             found[run.id] = Problem("rows", run.id, text, f"delete it there (`ssmail runs delete {run.name}`)")
         elif problem := next(damaged_rows(there, run), None):
             found[run.id] = problem
+        elif here.dialect.name != "sqlite" and (fault := _length_fault(there, run)):
+            found[run.id] = Problem("rows", run.id, f"{fault} (run {run.name})", "keep this run in an SQLite file")
     return found
+
+
+def _length_fault(there: Connection, run: RunRow) -> str | None:
+    """Return what of a run in an SQLite file of an earlier version a server does not store, or None."""
+    for table in (schema.run, *CHILDREN):
+        key = table.c.id if table is schema.run else table.c.run_id
+        texts = [column for column in raw(table) if isinstance(table.c[column.name].type, sa.String)]
+        for row in there.execute(select(*texts).where(key == run.id)).mappings():
+            if fault := schema.length_fault(table, {**row}):
+                return fault
+    return None
 
 
 def _leave_out(merged: Sequence[MergedRun], there: Connection, damaged: dict[str, Problem]) -> list[MergedRun]:

@@ -1,4 +1,7 @@
-"""SQLite database files: find and open them without upgrading, describe, back up, upgrade and write them."""
+"""Whole databases: find and open them without upgrading, describe, back up and upgrade them; write new SQLite files.
+
+What only a server has is in `server_database`.
+"""
 
 import sqlite3
 from collections.abc import Iterator
@@ -7,11 +10,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sqlalchemy import URL, Engine, func, select
+from sqlalchemy import URL, Connection, Engine, func, select
 
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError, command_line
 from ssmail.store import schema
+from ssmail.store.checkpoint_files import checkpoint_root
 from ssmail.store.connection import (
     BUSY_SECONDS,
     as_url,
@@ -22,8 +26,10 @@ from ssmail.store.connection import (
     reading,
     revision_of,
 )
+from ssmail.store.maintenance.server_database import dump, size_of
 from ssmail.store.queries import count_rows
 from ssmail.store.schema import REVISIONS
+from ssmail.store.server import missing_driver
 
 SIDE_FILES = ("-wal", "-shm", "-journal")
 """Suffixes of the files that SQLite may keep beside a database."""
@@ -42,13 +48,16 @@ class RunCount:
 
 @dataclass(frozen=True)
 class DatabaseInformation:
-    """What a database holds, with sizes in bytes. `size_bytes` includes the write-ahead log and `free_bytes`."""
+    """What a database holds, with sizes in bytes. `size_bytes` includes the write-ahead log and `free_bytes`.
 
-    path: Path
+    path: of an SQLite file; of a server its URL, without the password. free_bytes: None for a server.
+    """
+
+    path: Path | str
     revision: str | None  # None: no tables yet
     newest_revision: str
     size_bytes: int
-    free_bytes: int
+    free_bytes: int | None
     metrics: int = 0  # rows
     arrays: int = 0  # rows
     array_bytes: int = 0  # as compressed
@@ -65,60 +74,65 @@ class DatabaseInformation:
 class Upgrade:
     """What an upgrade did. `backup` is a copy of the old state; None if there was nothing to upgrade or keep."""
 
-    path: Path
+    path: Path | str
     before: str | None
     after: str
     backup: Path | None
 
 
-def existing(where: str | Path) -> Path:
-    """Return the file of an SQLite database, given its path or URL.
+def existing(where: str | Path) -> URL:
+    """Return the URL of a database, given its path or URL; whether a server has it shows when it is opened.
 
-    Raises InputError for a server database, a folder, or a file that does not exist.
+    Raises InputError for a folder, or a file that does not exist.
     """
-    path = file_of(where)
-    if not path.exists():
-        raise InputError(f"there is no database {path}; check the path, or create a database with `ssmail train`")
-    return path
-
-
-def file_of(where: str | Path) -> Path:
-    """Return the absolute path of an SQLite database, which may not exist. Raises InputError for a server database."""
     url = as_url(where)
-    if url.get_backend_name() != "sqlite":
+    if is_missing(url):
         raise InputError(
-            f"{name_of(url)} is a server database, but `ssmail db` is for SQLite files "
-            "only; use the server's own tools (any other command upgrades its tables when it opens it)"
+            f"there is no database {name_of(url)}; check the path, or create a database with `ssmail train`"
         )
-    return Path(str(url.database))
+    return url
+
+
+def is_missing(url: URL) -> bool:
+    """Return whether it is the URL of an SQLite file that does not exist."""
+    return url.get_backend_name() == "sqlite" and not Path(str(url.database)).exists()
+
+
+def place_of(url: URL) -> Path | str:
+    """Return the path of an SQLite file, or the URL of a server's database without the password."""
+    return Path(str(url.database)) if url.get_backend_name() == "sqlite" else name_of(url)
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Engine]:
-    """Yield an engine for the file, whatever its schema is; close all its connections afterwards."""
-    engine = make_engine(URL.create("sqlite", database=str(path)))
+def opened(where: URL | Path) -> Iterator[Engine]:
+    """Yield an engine for a database or file, whatever its schema is; close all its connections afterwards."""
+    url = where if isinstance(where, URL) else URL.create("sqlite", database=str(where))
+    try:
+        engine = make_engine(url)
+    except ImportError as error:
+        raise missing_driver(url, name_of(url)) from error
     try:
         yield engine
     finally:
         engine.dispose()
 
 
-def revision(path: Path) -> str | None:
-    """Return the schema revision of the file; None when it has no tables.
+def revision(where: URL | Path) -> str | None:
+    """Return the schema revision of a database; None when it has no tables.
 
-    Raises InputError when the file is damaged, is not an ssmail database, or is from a newer ssmail.
+    Raises InputError when it is damaged, is not an ssmail database, or is from a newer ssmail.
     """
-    with opened(path) as engine, reading(engine) as connection:
+    with opened(where) as engine, reading(engine, patience=0) as connection:
         return revision_of(connection, engine)
 
 
-def require_current(path: Path) -> None:
-    """Raise InputError unless the file has the schema that this ssmail writes."""
-    found = revision(path)
+def require_current(where: URL) -> None:
+    """Raise InputError unless the database has the schema that this ssmail writes."""
+    found = revision(where)
     if found != REVISIONS[-1]:
         state = "has no tables yet" if found is None else f"has schema {found}, but this ssmail reads {REVISIONS[-1]}"
-        command = command_line("ssmail", "db", "upgrade", "--db", path)
-        raise InputError(f"{path} {state}; upgrade it first with `{command}`")
+        command = command_line("ssmail", "db", "upgrade", "--db", name_of(where))
+        raise InputError(f"{name_of(where)} {state}; upgrade it first with `{command}`")
 
 
 @contextmanager
@@ -149,22 +163,19 @@ def _refuse_existing(target: Path) -> None:
 def describe_contents(where: str | Path) -> DatabaseInformation:
     """Describe one consistent state of the database, without upgrading or changing it.
 
-    Raises InputError when the file is missing or damaged, is not an ssmail database, or is from a newer ssmail.
+    Raises InputError when it is missing or damaged, is not an ssmail database, or is from a newer ssmail.
     """
-    path = existing(where)
-    found = revision(path)
-    log, run = path.with_name(path.name + "-wal"), schema.run
-    size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
-    free_pages = "SELECT freelist_count * page_size FROM pragma_freelist_count, pragma_page_size"
+    url = existing(where)
+    found, run = revision(url), schema.run
     array_sizes = select(func.coalesce(func.sum(func.length(schema.array.c.data)), 0))
     columns = (run.c.environment, run.c.method, run.c.profile, run.c.state)
-    runs = select(*columns, func.count()).group_by(*columns).order_by(*columns)
-    with opened(path) as engine, reading(engine) as connection:
-        free = int(connection.exec_driver_sql(free_pages).scalar_one())
+    runs = select(*columns, func.count()).group_by(*columns)
+    with opened(url) as engine, reading(engine) as connection:
+        size, free = _sizes(url, connection)
         if found is None:
-            return DatabaseInformation(path, found, REVISIONS[-1], size, free)
+            return DatabaseInformation(place_of(url), found, REVISIONS[-1], size, free)
         return DatabaseInformation(
-            path,
+            place_of(url),
             found,
             REVISIONS[-1],
             size,
@@ -173,37 +184,54 @@ def describe_contents(where: str | Path) -> DatabaseInformation:
             arrays=count_rows(connection, schema.array),
             array_bytes=int(connection.execute(array_sizes).scalar_one()),
             artifacts=count_rows(connection, schema.artifact),
-            runs=tuple(RunCount(*row) for row in connection.execute(runs)),
+            runs=tuple(RunCount(*row) for row in sorted(map(tuple, connection.execute(runs)), key=str)),
         )
 
 
+def _sizes(url: URL, connection: Connection) -> tuple[int, int | None]:
+    """Return the size of the database, and how much of it is free, in bytes."""
+    if url.get_backend_name() != "sqlite":
+        return size_of(connection), None
+    path = Path(str(url.database))
+    log = path.with_name(path.name + "-wal")
+    free_pages = "SELECT freelist_count * page_size FROM pragma_freelist_count, pragma_page_size"
+    size = path.stat().st_size + (log.stat().st_size if log.exists() else 0)
+    return size, int(connection.exec_driver_sql(free_pages).scalar_one())
+
+
 def back_up(where: str | Path, target: Path) -> int:
-    """Copy the database to the new file `target` and return its size in bytes.
+    """Copy the database to the new file `target` and return its size in bytes; a server's is in pg_dump's format.
 
     The copy is one consistent state of the database, even while runs are written, and makes no writer wait. Checkpoint
     files are not copied. Raises InputError when `target` exists or cannot be written, or when `where` is damaged or not
     an ssmail database.
     """
-    path = existing(where)
-    revision(path)
-    with new_file(target.absolute()) as partial, explained_errors(str(path)):
-        _copy_pages(path, partial)
+    url = existing(where)
+    revision(url)
+    with new_file(target.absolute()) as partial, explained_errors(name_of(url)):
+        if url.get_backend_name() == "sqlite":
+            _copy_pages(Path(str(url.database)), partial)
+        else:
+            dump(url, partial)
     return target.stat().st_size
 
 
 def upgrade(where: str | Path) -> Upgrade:
-    """Back up the database beside the file, then upgrade it to the newest schema in one transaction.
+    """Back up the database, then upgrade it to the newest schema in one transaction.
 
-    Raises InputError, and changes nothing, when ssmail cannot use the file.
+    The backup is beside the file; that of a server is beside its checkpoints. Raises InputError, and changes nothing,
+    when ssmail cannot use the database.
     """
-    path = existing(where)
-    before = revision(path)
+    url = existing(where)
+    before = revision(url)
     backup = None
     if before is not None and before != REVISIONS[-1]:
-        backup = path.with_name(f"{path.stem}-schema-{before}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}{path.suffix}")
-        back_up(path, backup)
-    connect(path).dispose()
-    return Upgrade(path, before, REVISIONS[-1], backup)
+        on_server = url.get_backend_name() != "sqlite"
+        file = checkpoint_root(url).with_name("ssmail.dump") if on_server else Path(str(url.database))
+        backup = file.with_name(f"{file.stem}-schema-{before}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}{file.suffix}")
+        back_up(where, backup)
+    connect(where).dispose()
+    return Upgrade(place_of(url), before, REVISIONS[-1], backup)
 
 
 def _copy_pages(path: Path, partial: Path) -> None:
