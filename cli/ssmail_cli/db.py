@@ -62,8 +62,8 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
 def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
     """Bring the tables to the newest schema.
 
-    First writes a backup beside the file, or of a server's database in results/. All other commands also upgrade an older database when they open it, but
-    without a backup.
+    First writes a backup: of a file beside it, of a server's database into results/. All other commands also upgrade an
+    older database when they open it, but without a backup.
     """
     from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
 
@@ -104,7 +104,8 @@ def backup(
 ) -> None:
     """Copy the database to a new file.
 
-    A copy of a server's database is made by pg_dump, for pg_restore. Safe while runs are being computed. Checkpoints, which are separate files, are not copied.
+    That of a server is written by pg_dump, for pg_restore. Safe while runs are being computed. Checkpoints, which are
+    separate files, are not copied.
     """
     from ssmail.store.maintenance.sqlite_file import back_up
 

@@ -116,10 +116,11 @@ def test_export(cli: CommandLine, filled: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "line", ["info", "upgrade", "check", "backup new.db", "merge other.db", "export --compact new.db"]
 )
-def test_what_is_no_sqlite_file_of_ssmails_is_one_sentence(line: str, cli: CommandLine, tmp_path: Path) -> None:
+def test_what_is_no_database_of_ssmails_is_one_sentence(line: str, cli: CommandLine, tmp_path: Path) -> None:
     words = [str(tmp_path / word) if word.endswith(".db") else word for word in line.split()]
     Store.open(tmp_path / "other.db").close()
-    assert "is for SQLite files only" in cli("db", *words, "--db", "postgresql://host/name").sentence
+    nowhere = f"postgresql://host/name?host={tmp_path}"  # as the folder of a socket
+    assert "cannot connect to the database" in cli("db", *words, "--db", nowhere).sentence
     (tmp_path / "notes.txt").write_bytes(b"These are my notes, not a database. " * 100)
     assert "is not an SQLite database" in cli("db", *words, "--db", tmp_path / "notes.txt").sentence
     change(tmp_path / "foreign.db", "CREATE TABLE run (id TEXT)")

@@ -19,6 +19,7 @@ import ssmail.store
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunState, Store, connection
+from ssmail.store.maintenance.checks import check
 from ssmail.store.schema import REVISIONS, metadata
 
 ASSETS = Path(__file__).parent / "assets"
@@ -154,7 +155,7 @@ REFUSED: dict[str, tuple[Callable[[Path], str], str]] = {
     "no URL": (lambda _: "://", "neither a path nor a database URL"),
     "no dialect": (lambda _: "nosuch://host/name", "nosuch is no database that ssmail knows; use sqlite or postgresql"),
     "any module": (lambda _: "sqlite+idlelib:///x.db", "idlelib is no database that ssmail knows"),
-    "no driver": (lambda _: "postgresql://host/name", r"no driver for the database URL postgresql://host/name"),
+    "no server": (lambda folder: f"postgresql:///name?host={folder}", r"cannot connect to the database postgresql:///"),
     "long": (lambda _: 300 * "a", "is no path; give that of a database file"),
 }
 
@@ -170,9 +171,18 @@ def test_what_cannot_be_used_is_one_sentence(make: Callable[[Path], str], senten
 
 
 def test_a_password_is_not_shown() -> None:
-    with pytest.raises(InputError, match=r"postgresql://me:\*\*\*@host") as caught:
-        Store.open("postgresql://me:secret@host/name")
+    with pytest.raises(InputError, match=r"postgresql://me:\*\*\*@127.0.0.1:1/name") as caught:
+        Store.open("postgresql://me:secret@127.0.0.1:1/name")
     assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize("url", ["postgresql://me:secret@host/name", "postgresql+psycopg://me:secret@host/name"])
+def test_without_the_extra_the_sentence_says_how_to_install_it(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    for use in (Store.open, check):
+        with pytest.raises(InputError, match=r"run `pip install 'ssmail\[postgres\]'`$") as caught:
+            use(url)
+        assert "postgresql://me:***@host/name" in str(caught.value)
 
 
 @pytest.mark.parametrize(

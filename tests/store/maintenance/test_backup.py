@@ -103,8 +103,6 @@ def test_a_damaged_database_is_not_backed_up(store: Store, tmp_path: Path) -> No
 def test_what_cannot_be_backed_up_is_refused(store: Store, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="there is no database"):
         back_up(tmp_path / "missing.db", tmp_path / "backup.db")
-    with pytest.raises(InputError, match="for SQLite files only"):
-        back_up("postgresql://host/name", tmp_path / "backup.db")
     (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot be written"):
         back_up(store.where, tmp_path / "file" / "backup.db")

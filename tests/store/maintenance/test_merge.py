@@ -293,7 +293,6 @@ def test_what_cannot_be_merged_is_refused_and_changes_nothing(here: Store, there
     refused = {
         here.where: "is the database itself",
         str(tmp_path / "missing.db"): "there is no database",
-        "postgresql://host/name": "for SQLite files only",
     }
     (tmp_path / "garbage.db").write_bytes(b"no database at all " * 300)
     refused[str(tmp_path / "garbage.db")] = r"garbage\.db is not an SQLite database"

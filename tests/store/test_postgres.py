@@ -1,0 +1,354 @@
+"""A database on a PostgreSQL server: the same contents as in SQLite, by any number of processes, whatever breaks."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sqlalchemy import make_url, text
+
+from ssmail.config.experiments import build_spec
+from ssmail.config.spec import RunSpec
+from ssmail.errors import InputError, SsmailError
+from ssmail.store import RunState, RunWriter, Store, connection, server
+from ssmail.store.connection import as_url, describe, make_engine, write
+from tests.store.databases import SPEC, add
+from tests.store.postgres_server import PASSWORD, Server
+
+VALUES = {"validation/mode_mse": 0.1 + 0.2, "b": np.nan, "B": -np.inf, "c": np.inf, "a_b": 5e-324, "a/b": 1e308}
+
+
+@pytest.fixture
+def remote(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    """A store on the server; its checkpoints are below the test's folder."""
+    monkeypatch.chdir(tmp_path)
+    opened = Store.open(url)
+    yield opened
+    opened.close()
+
+
+def start(store: Store, seed: int = 0, spec: RunSpec = SPEC) -> RunWriter:
+    return store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu")
+
+
+def terminate(server: Server, store: Store) -> int:
+    """End all connections to the store's database, as an administrator does; how many there were."""
+    with server.connect() as admin:
+        query = "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity WHERE datname = %s"
+        row = admin.execute(query, (store._engine.url.database,)).fetchone()
+    assert row is not None
+    return int(row[0])
+
+
+def test_what_is_stored_is_read_as_from_sqlite(remote: Store, store: Store) -> None:
+    for each in (remote, store):
+        writer = start(each)
+        writer.epoch(1, VALUES)
+        writer.epoch(2, {name: -value for name, value in VALUES.items()})
+        writer.final(2, {"test/mode_mse": 1 / 3})
+        writer.arrays({"x": np.arange(6.0).reshape(2, 3), "mask": np.array([True, False])})
+        writer.finish(RunState.FINISHED)
+    frames = []
+    for each in (remote, store):
+        (run,) = each.runs(method="ssail", state="finished")
+        assert run.started.utcoffset() is not None
+        np.testing.assert_array_equal(each.array(run.id, "x"), [[0, 1, 2], [3, 4, 5]])
+        assert each.array_names(run.id) == ["mask", "x"]
+        assert [row.id for row in each.runs(ids=[run.id[:6]])] == [run.id]
+        frames += [(each.metrics([run.id]), each.latest_metrics([run.id]))]
+    for there, here in zip(*frames, strict=True):
+        assert there.drop(columns="run_id").equals(here.drop(columns="run_id"))
+    assert [*dict.fromkeys(frames[0][0]["name"])] == sorted([*VALUES, "test/mode_mse"])  # in the order of bytes
+
+
+def open_at_once(url: str, users: int = 8) -> list[str]:
+    """Open a database from threads with an engine each; what went wrong."""
+    barrier = threading.Barrier(users)
+
+    def attempt(_: int) -> str:
+        barrier.wait()
+        try:
+            Store.open(url).close()
+        except SsmailError as error:
+            return str(error)
+        return ""
+
+    with ThreadPoolExecutor(users) as pool:
+        return [said for said in pool.map(attempt, range(users)) if said]
+
+
+def test_a_new_database_may_be_opened_by_many_at_once(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert open_at_once(server.url(server.new_database())) == []
+    monkeypatch.setattr(connection.server, "lock_schema", lambda _: None)  # negative control
+    assert any(open_at_once(server.url(server.new_database())) for _ in range(5))
+
+
+def claim_at_once(url: str, seeds: int, users: int = 4) -> list[int]:
+    """Let every user start a run of each cell; how many runs of each cell there are."""
+    barrier, stores = threading.Barrier(users), [Store.open(url) for _ in range(users)]
+
+    def attempt(own: Store) -> None:
+        for seed in range(seeds):
+            barrier.wait()
+            with suppress(InputError):  # it is being computed by another process
+                start(own, seed)
+
+    with ThreadPoolExecutor(users) as pool:
+        list(pool.map(attempt, stores))
+    found = [run.seed for run in stores[0].runs()]
+    for each in stores:
+        each.close()
+    return [found.count(seed) for seed in range(seeds)]
+
+
+def test_one_of_several_gets_a_cell(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert claim_at_once(server.url(server.new_database()), seeds=10) == [1] * 10
+    monkeypatch.setattr(connection.server, "lock_cells", lambda _: None)  # negative control
+    assert max(claim_at_once(server.url(server.new_database()), seeds=20)) > 1
+
+
+def in_opposite_order(url: str, patience: float | None) -> list[str]:
+    """Two transactions that lock two runs each, the second one first: one of them meets a deadlock."""
+    barrier = threading.Barrier(2)
+
+    def attempt(order: tuple[int, int]) -> str:
+        own = Store.open(url)
+
+        def work(open_connection: Any, again: bool) -> None:
+            for seed in order:
+                open_connection.execute(text(f"UPDATE run SET resumes = resumes + 1 WHERE seed = {seed}"))
+                if not again and seed == order[0]:
+                    barrier.wait()
+
+        try:
+            write(own._engine, work, patience)
+        except SsmailError as error:
+            return str(error)
+        finally:
+            own.close()
+        return ""
+
+    with ThreadPoolExecutor(2) as pool:
+        return [said for said in pool.map(attempt, [(0, 1), (1, 0)]) if said]
+
+
+def test_a_deadlock_is_tried_again(remote: Store) -> None:
+    start(remote, 0)
+    start(remote, 1)
+    (said,) = in_opposite_order(remote.url, patience=0)  # negative control
+    assert "deadlock detected" in said
+    assert [run.resumes for run in remote.runs()] == [1, 1]
+    assert in_opposite_order(remote.url, patience=None) == []
+    assert [run.resumes for run in remote.runs()] == [3, 3]
+
+
+def count_up_at_once(url: str, patience: float | None) -> list[str]:
+    """Two serializable transactions that read and write the same row."""
+    barrier = threading.Barrier(2)
+
+    def attempt(own: Store) -> str:
+        def work(open_connection: Any, again: bool) -> None:
+            open_connection.execute(text("SET TRANSACTION ISOLATION LEVEL SERIALIZABLE"))
+            found = open_connection.execute(text("SELECT resumes FROM run")).scalar_one()
+            if not again:
+                barrier.wait()
+            open_connection.execute(text(f"UPDATE run SET resumes = {found + 1}"))
+
+        try:
+            write(own._engine, work, patience)
+        except SsmailError as error:
+            return str(error)
+        return ""
+
+    stores = [Store.open(url) for _ in range(2)]
+    with ThreadPoolExecutor(2) as pool:
+        said = [said for said in pool.map(attempt, stores) if said]
+    for each in stores:
+        each.close()
+    return said
+
+
+def test_a_serialization_failure_is_tried_again(remote: Store) -> None:
+    start(remote)
+    (said,) = count_up_at_once(remote.url, patience=0)  # negative control
+    assert "could not serialize access" in said
+    assert count_up_at_once(remote.url, patience=None) == []
+    assert remote.runs()[0].resumes == 3
+
+
+def lost_answer(store: Store, monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
+    """Lose the connection right after the next commit; the result says how many commits were asked for since."""
+    import psycopg
+
+    commit, commits = store._engine.dialect.do_commit, []
+
+    def lose(dbapi_connection: Any) -> None:
+        commit(dbapi_connection)
+        commits.append(1)
+        if len(commits) == 1:
+            dbapi_connection.dbapi_connection.close()
+            raise psycopg.OperationalError("server closed the connection unexpectedly")
+
+    monkeypatch.setattr(store._engine.dialect, "do_commit", lose)
+    return lambda: len(commits)
+
+
+@pytest.mark.parametrize("step", ["start", "epoch", "final", "arrays", "resume", "finish", "delete"])
+def test_a_commit_whose_answer_is_lost_counts_once(step: str, remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    if step == "start":
+        commits = lost_answer(remote, monkeypatch)
+        writer = start(remote)
+    else:
+        writer = start(remote)
+        writer.epoch(1, {"a": 0.5, "b": np.nan})
+        if step == "resume":
+            writer.finish(RunState.INTERRUPTED)
+        commits = lost_answer(remote, monkeypatch)
+    if step == "epoch":
+        writer.epoch(2, {"a": 1.0, "b": np.nan})
+    elif step == "final":
+        writer.final(1, {"test/a": 1.0})
+    elif step == "arrays":
+        writer.arrays({"x": np.zeros(2)})
+    elif step == "resume":
+        writer = remote.resume_run(writer.run_id, 1)
+    elif step == "finish":
+        writer.finish(RunState.FINISHED)
+    elif step == "delete":
+        writer.finish(RunState.FAILED)
+        assert commits() == 2
+        commits = lost_answer(remote, monkeypatch)
+        remote.delete([writer.run_id])
+    assert commits() == 2
+    rows = remote.metrics([writer.run_id])[["name", "step"]].values.tolist()
+    wanted = {"start": [], "delete": [], "epoch": [["a", 1], ["a", 2], ["b", 1], ["b", 2]]}
+    assert rows == wanted.get(step, [["a", 1], ["b", 1]] + ([["test/a", 1]] if step == "final" else []))
+    assert len(remote.runs()) == (step != "delete")
+    if step == "resume":
+        assert remote.runs()[0].resumes == 1
+        writer.epoch(2, {"a": 1.0})
+
+
+def test_an_epoch_that_is_not_recognized_would_be_refused(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control, for the epoch above; and an epoch that was there before is refused as in SQLite."""
+    writer = start(remote)
+    monkeypatch.setattr(RunWriter, "_has", lambda *_: False)
+    lost_answer(remote, monkeypatch)
+    with pytest.raises(SsmailError, match="already has metrics for step 1"):
+        writer.epoch(1, {"a": 0.5})
+    monkeypatch.undo()
+    with pytest.raises(SsmailError, match="already has metrics for step 1"):
+        writer.epoch(1, {"a": 0.5})
+
+
+def test_a_connection_that_breaks_loses_no_epoch(server: Server, remote: Store) -> None:
+    writer = start(remote)
+    for epoch in range(1, 6):
+        assert terminate(server, remote) > 0
+        writer.epoch(epoch, {"a": epoch})
+        terminate(server, remote)
+        writer.heartbeat()
+    terminate(server, remote)
+    assert remote.metrics([writer.run_id])["step"].tolist() == [1, 2, 3, 4, 5]
+    assert remote.still_stored([writer.run_id])
+
+
+def test_a_server_that_is_killed_is_waited_for(server: Server, remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    writer = start(remote)
+    server.kill()
+    try:
+        began = time.monotonic()
+        with pytest.raises(SsmailError, match=r"cannot connect to the database|connection to the database .* broke"):
+            writer.heartbeat()  # the next one is soon enough
+        with pytest.raises(InputError, match=r"cannot connect to the database .* check its URL"):
+            Store.open(remote.url)
+        assert time.monotonic() - began < connection.BUSY_SECONDS
+        monkeypatch.setattr(connection, "BUSY_SECONDS", 0.1)
+        with pytest.raises(SsmailError):  # negative control: without patience
+            writer.epoch(1, {"a": 1.0})
+        monkeypatch.undo()
+        thread = threading.Timer(0.3, server.start)
+        thread.start()
+        writer.epoch(1, {"a": 1.0})
+        thread.join()
+    finally:
+        if server.process.poll() is not None:
+            server.start()
+    writer.finish(RunState.FINISHED)
+    assert remote.metrics([writer.run_id])["step"].tolist() == [1]
+
+
+def test_a_held_lock_is_one_sentence(server: Server, database: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "BUSY_SECONDS", 1)
+    hasty = Store.open(server.url(database))
+    writer = start(hasty)
+    with server.connect(database) as holder, holder.transaction():
+        holder.execute("LOCK TABLE run IN EXCLUSIVE MODE")
+        with pytest.raises(SsmailError, match="another program holds a lock in the database"):
+            writer.epoch(1, {"a": 1.0})
+        assert len(hasty.runs()) == 1  # reading waits for nobody
+    writer.epoch(1, {"a": 1.0})
+    hasty.close()
+
+
+def named(letters: int) -> RunSpec:
+    return build_spec("ssail", "yjunction", "smoke").model_copy(update={"profile": "p" * letters})
+
+
+@pytest.mark.parametrize("engine", ["remote", "store"])
+def test_both_engines_have_the_same_limits(engine: str, request: pytest.FixtureRequest) -> None:
+    each = request.getfixturevalue(engine)
+    with pytest.raises(InputError, match=r"the run's profile 'p+ \.\.\. p+' has 65 characters, .* keeps 64; give a"):
+        start(each, spec=named(65))
+    assert each.runs() == []
+    writer = start(each, spec=named(64))
+    assert [run.profile for run in each.runs()] == ["p" * 64]
+    with pytest.raises(InputError, match=r"the metric's name .* has 129 characters, of which the database keeps 128"):
+        writer.epoch(1, {"m" * 129: 0.5})
+    writer.epoch(1, {"m" * 128: 0.5})
+    with pytest.raises(InputError, match=r"the array's name .* has 129 characters"):
+        writer.arrays({"x" * 129: np.zeros(1)})
+    with pytest.raises(InputError, match="has a null character"):
+        writer.epoch(2, {"a\0b": 0.5})
+    writer.finish(RunState.FAILED, "it printed \0 and died")
+    assert each.runs()[0].error == "it printed \\0 and died"
+
+
+def test_sqlite_itself_has_no_such_limit_but_the_server_has(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control for the limits: without the check, the server answers with an error of its own."""
+    monkeypatch.setattr("ssmail.store.run_store.require_fitting", lambda *_: None)
+    with pytest.raises(SsmailError, match="value too long for type character varying"):
+        start(remote, spec=named(65))
+
+
+def test_other_drivers_and_forms_of_a_url() -> None:
+    assert as_url("postgresql://me@h/d").drivername == "postgresql+psycopg"
+    assert as_url("postgresql+pg8000://me@h/d").drivername == "postgresql+pg8000"
+    assert describe(make_engine(as_url("postgresql://me:pw@h/d"))) == "postgresql://me:***@h/d"
+    found = server.arguments(make_url("postgresql+psycopg://h/d?connect_timeout=3&options=-cx%3D1"), 120)
+    assert not found.keys() & {"connect_timeout", "options"}
+    assert server.arguments(make_url("postgresql+psycopg://h/d"), 120)["options"] == "-c lock_timeout=120s"
+
+
+def test_a_database_of_another_program_is_refused(server: Server, database: str) -> None:
+    with server.connect(database) as admin:
+        admin.execute("CREATE TABLE theirs (id int)")
+    with pytest.raises(InputError, match="is a database of another program"):
+        Store.open(server.url(database))
+    with pytest.raises(InputError, match=r"cannot connect to the database .*nosuch.* does not exist"):
+        Store.open(server.url("nosuch"))
+
+
+def test_runs_are_deleted_with_all_they_recorded(remote: Store) -> None:
+    run = add(remote)
+    assert (remote.checkpoint_root / run).is_dir()
+    remote.delete([run[:8]])
+    assert remote.runs() == []
+    assert remote.metrics([run]).empty
+    assert not (remote.checkpoint_root / run).exists()
+    assert PASSWORD not in remote.where
