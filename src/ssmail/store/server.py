@@ -114,7 +114,8 @@ def explained(error: DBAPIError, where: str) -> SsmailError:
 
 
 def _cannot_connect(error: DBAPIError) -> bool:
-    return isinstance(error, OperationalError) and error.statement is None and not _state(error)
+    made = error.connection_invalidated or error.statement is not None or _state(error)
+    return isinstance(error, OperationalError) and not made
 
 
 def _state(error: DBAPIError) -> str:
