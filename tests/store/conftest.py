@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -37,3 +38,12 @@ def database(server: Server) -> str:
 def url(server: Server, database: str) -> str:
     """The URL of that database, with the password."""
     return server.url(database)
+
+
+@pytest.fixture
+def remote(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
+    """A store on the server; its checkpoints are below the test's folder."""
+    monkeypatch.chdir(tmp_path)
+    opened = Store.open(url)
+    yield opened
+    opened.close()

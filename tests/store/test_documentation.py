@@ -70,7 +70,7 @@ def test_the_python_examples_run(database: Path) -> None:
 
 def test_the_sql_examples_run(database: Path) -> None:
     (summary,) = blocks("sql")
-    (backup,) = re.findall(r'"(VACUUM .*?)"', blocks("sh")[0])
+    (backup,) = re.findall(r'"(VACUUM .*?)"', "".join(blocks("sh")))
     connection = sqlite3.connect(database, isolation_level=None)
     rows = connection.execute(summary).fetchall()
     assert [(row[0], row[1], row[3], row[4]) for row in rows] == [

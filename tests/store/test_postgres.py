@@ -2,17 +2,15 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from sqlalchemy import make_url, text
 
-from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunState, RunWriter, Store, connection, server
@@ -21,15 +19,6 @@ from tests.store.databases import SPEC, add
 from tests.store.postgres_server import PASSWORD, Server
 
 VALUES = {"validation/mode_mse": 0.1 + 0.2, "b": np.nan, "B": -np.inf, "c": np.inf, "a_b": 5e-324, "a/b": 1e308}
-
-
-@pytest.fixture
-def remote(url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Store]:
-    """A store on the server; its checkpoints are below the test's folder."""
-    monkeypatch.chdir(tmp_path)
-    opened = Store.open(url)
-    yield opened
-    opened.close()
 
 
 def start(store: Store, seed: int = 0, spec: RunSpec = SPEC) -> RunWriter:
@@ -294,36 +283,6 @@ def test_a_held_lock_is_one_sentence(server: Server, database: str, monkeypatch:
         assert len(hasty.runs()) == 1  # reading waits for nobody
     writer.epoch(1, {"a": 1.0})
     hasty.close()
-
-
-def named(letters: int) -> RunSpec:
-    return build_spec("ssail", "yjunction", "smoke").model_copy(update={"profile": "p" * letters})
-
-
-@pytest.mark.parametrize("engine", ["remote", "store"])
-def test_both_engines_have_the_same_limits(engine: str, request: pytest.FixtureRequest) -> None:
-    each = request.getfixturevalue(engine)
-    with pytest.raises(InputError, match=r"the run's profile 'p+ \.\.\. p+' has 65 characters, .* keeps 64; give a"):
-        start(each, spec=named(65))
-    assert each.runs() == []
-    writer = start(each, spec=named(64))
-    assert [run.profile for run in each.runs()] == ["p" * 64]
-    with pytest.raises(InputError, match=r"the metric's name .* has 129 characters, of which the database keeps 128"):
-        writer.epoch(1, {"m" * 129: 0.5})
-    writer.epoch(1, {"m" * 128: 0.5})
-    with pytest.raises(InputError, match=r"the array's name .* has 129 characters"):
-        writer.arrays({"x" * 129: np.zeros(1)})
-    with pytest.raises(InputError, match="has a null character"):
-        writer.epoch(2, {"a\0b": 0.5})
-    writer.finish(RunState.FAILED, "it printed \0 and died")
-    assert each.runs()[0].error == "it printed \\0 and died"
-
-
-def test_sqlite_itself_has_no_such_limit_but_the_server_has(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Negative control for the limits: without the check, the server answers with an error of its own."""
-    monkeypatch.setattr("ssmail.store.run_store.require_fitting", lambda *_: None)
-    with pytest.raises(SsmailError, match="value too long for type character varying"):
-        start(remote, spec=named(65))
 
 
 def test_other_drivers_and_forms_of_a_url() -> None:
