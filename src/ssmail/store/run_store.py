@@ -1,9 +1,11 @@
 """The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
+import os
 import uuid
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from copy import copy
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,6 +18,7 @@ from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import checkpoint_root_of, remove_run_folder
 from ssmail.store.connection import connect, describe, reading, writing
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
+from ssmail.store.queue import Claim, Queue, end, interrupt, new_row
 from ssmail.store.schema import RunState
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
 from ssmail.store.writer import RunWriter
@@ -45,12 +48,12 @@ class Store:
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
-    def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS) -> Self:
+    def open(cls, where: str | Path, *, stale_seconds: float | None = None) -> Self:
         """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
         Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        return cls(connect(where), stale_seconds)
+        return cls(connect(where), _stale_seconds() if stale_seconds is None else stale_seconds)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -83,6 +86,11 @@ class Store:
             queries.refuse(damaged)
         self.damaged |= damaged
         return found if self._only is None else [row for row in found if row.id in self._only]
+
+    def run(self, run_id: str) -> RunRow:
+        """Return the run with that full id. Raises InputError when there is none, or its row is damaged."""
+        with reading(self._engine) as connection:
+            return queries.one_run(connection, run_id)
 
     def full_ids(self, ids: Sequence[str]) -> list[str]:
         """Return the full id for each id or prefix, also of a damaged row.
@@ -120,12 +128,22 @@ class Store:
 
     def is_alive(self, row: RunRow) -> bool:
         """Return whether a process is computing the run: it is RUNNING and has sent a heartbeat recently."""
-        return row.is_alive(self.stale_seconds)
+        return row.is_alive(self.stale_seconds, self._now())
+
+    def _now(self) -> datetime:
+        with reading(self._engine) as connection:
+            return queries.clock(connection)
+
+    @property
+    def queue(self) -> Queue:
+        """The cells that wait, and who computes which."""
+        return Queue(self._engine, self.stale_seconds)
 
     def require_idle(self, row: RunRow) -> None:
         """Raise InputError when another process is computing the run."""
-        if self.is_alive(row):
-            silent = row.silent_seconds
+        now = self._now()
+        if row.is_alive(self.stale_seconds, now):
+            silent = row.silent_seconds(now)
             when = f"{silent:.0f} s ago" if silent >= 0 else f"{-silent:.0f} s ahead of this clock"
             raise InputError(
                 f"seed {row.seed} of this spec is being computed by another process on {row.host} (run {row.name}, "
@@ -141,7 +159,7 @@ class Store:
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the
         cell, or when the cell has finished or diverged already, unless `repeat` allows a new run beside the old one.
         """
-        run_id, owner, metadata = uuid.uuid4().hex, uuid.uuid4().hex, run_metadata.columns()
+        owner = uuid.uuid4().hex
         with writing(self._engine) as connection:
             newest = queries.newest_of_cell(connection, spec.hash(), seed)
             if newest is not None:
@@ -151,41 +169,25 @@ class Store:
                         f"seed {seed} of this spec has {newest.state} already, as run {newest.name}; delete it first"
                     )
                 if newest.state is RunState.RUNNING:
-                    _interrupt(connection, newest)
-            now = datetime.now(UTC)
-            row = {
-                "id": run_id,
-                "method": spec.method,
-                "environment": spec.environment,
-                "profile": spec.profile,
-                "seed": seed,
-                "spec_json": spec.as_json(),
-                "spec_hash": spec.hash(),
-                "dataset_hash": dataset_hash,
-                "state": RunState.RUNNING,
-                "started": now,
-                "heartbeat": now,
-                "owner": owner,
-                "resumes": 0,
-                "device": device,
-                "wall_seconds": 0.0,
-                "cpu_seconds": 0.0,
-                **metadata,
-            }
+                    interrupt(connection, newest)
+            row = new_row(spec, seed, RunState.RUNNING, owner, queries.clock(connection))
+            row |= {"dataset_hash": dataset_hash, "device": device}
             connection.execute(insert(schema.run), row)
-        return RunWriter(self._engine, self.checkpoint_root, run_id, owner)
+        return RunWriter(self._engine, self.checkpoint_root, row["id"], owner)
 
-    def resume_run(self, run_id: str, from_step: int) -> RunWriter:
+    def resume_run(self, run_id: str, from_step: int, claim: Claim | None = None, **begun: str | None) -> RunWriter:
         """Continue an unfinished run after epoch `from_step`, dropping the metrics of later epochs.
 
+        With a claim of the run, only who made it may do so. begun: its columns dataset_hash and device, if they change.
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the run
         or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
         `from_step`.
         """
-        owner, metadata = uuid.uuid4().hex, run_metadata.columns()
+        owner = claim.owner if claim else uuid.uuid4().hex
         with writing(self._engine) as connection:
             row = queries.one_run(connection, run_id)
-            self.require_idle(row)
+            if claim is None or row.owner != owner:
+                self.require_idle(row)
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             _drop_metrics_after(connection, row, from_step)
@@ -193,10 +195,11 @@ class Store:
                 "state": RunState.RUNNING,
                 "error": None,
                 "finished": None,
-                "heartbeat": datetime.now(UTC),
+                "heartbeat": queries.clock(connection),
                 "owner": owner,
-                "resumes": row.resumes + 1,
-                **metadata,
+                "resumes": row.resumes + (claim is None or row.has_begun),
+                **run_metadata.columns(),
+                **begun,
             }
             connection.execute(update(schema.run).where(schema.run.c.id == run_id).values(changes))
         return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row)
@@ -206,13 +209,13 @@ class Store:
         with writing(self._engine) as connection:
             found = queries.silent_runs(connection, self.stale_seconds)
             for row in found:
-                _interrupt(connection, row)
+                interrupt(connection, row)
         return found
 
-    def end_dead_run(self, run_id: str, state: RunState, error: str) -> None:
-        """Set the state of a RUNNING run whose process is known to be dead; leave a run in any other state alone."""
+    def end_dead_run(self, run_id: str, state: RunState, error: str, owner: str | None = None) -> None:
+        """Set the state of a RUNNING run, of that owner if one is given, whose process is known to be dead."""
         with writing(self._engine) as connection:
-            _end(connection, run_id, state, error)
+            end(connection, run_id, state, error, owner)
 
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
@@ -308,20 +311,13 @@ class Store:
         return run.state.settled and not self.artifacts(run.id)
 
 
-def _interrupt(connection: Connection, row: RunRow) -> None:
-    """Mark a run whose process is silent as INTERRUPTED."""
-    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
-    ahead = row.silent_seconds < 0
-    error = (
-        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
-    )
-    _end(connection, row.id, RunState.INTERRUPTED, error)
-
-
-def _end(connection: Connection, run_id: str, state: RunState, error: str) -> None:
-    running = (schema.run.c.id == run_id) & (schema.run.c.state == RunState.RUNNING)
-    values = {"state": state, "error": error, "finished": datetime.now(UTC)}
-    connection.execute(update(schema.run).where(running).values(values))
+def _stale_seconds() -> float:
+    """Return the value of SSMAIL_STALE_SECONDS, by default STALE_SECONDS. Raises InputError if it is no such number."""
+    text = os.environ.get("SSMAIL_STALE_SECONDS")
+    with suppress(ValueError):
+        if text is None or 0 < float(text) < 1e6:
+            return STALE_SECONDS if text is None else float(text)
+    raise InputError(f"SSMAIL_STALE_SECONDS is {shortened(str(text), 40)!r}; give a number of seconds above 0")
 
 
 def _drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:

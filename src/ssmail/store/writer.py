@@ -8,7 +8,6 @@ import hashlib
 import math
 import time
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +16,11 @@ from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
 from sqlalchemy.exc import IntegrityError
 
 from ssmail.errors import SsmailError
-from ssmail.store import arrays, run_metadata, schema
+from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import run_folder
 from ssmail.store.connection import writing
 from ssmail.store.queries import RunRow
+from ssmail.store.queue import left_state
 from ssmail.store.schema import RunState
 
 
@@ -83,16 +83,21 @@ class RunWriter:
         self._replace(schema.artifact, [{"run_id": self.run_id, **row, "sha256": hashlib.sha256(content).hexdigest()}])
 
     def finish(self, state: RunState, error: str | None = None) -> None:
-        """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards."""
+        """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards.
+
+        A run from the queue that is INTERRUPTED waits again.
+        """
         if state in (RunState.QUEUED, RunState.RUNNING):
             raise SsmailError(f"a run cannot end in the state {state}")
+        if state is RunState.INTERRUPTED:
+            state = left_state(self._owner)
         with writing(self._engine) as connection:
-            self._touch(connection, state=state, error=error, finished=datetime.now(UTC))
+            self._touch(connection, state=state, error=error, finished=queries.clock(connection))
 
     def _touch(self, connection: Connection, **changes: Any) -> None:
         run = schema.run
         mine = (run.c.id == self.run_id) & (run.c.owner == self._owner) & (run.c.state == RunState.RUNNING)
-        values = {"heartbeat": datetime.now(UTC), **self._resources(), **changes}
+        values = {"heartbeat": queries.clock(connection), **self._resources(), **changes}
         if connection.execute(update(run).where(mine).values(values)).rowcount == 1:
             return
         state = connection.execute(select(run.c.state).where(run.c.id == self.run_id)).scalar()
