@@ -166,7 +166,7 @@ class QueueSource:
         self._deadline = None if max_hours is None else now + 3600 * max_hours
         self._busy, self._next_look = now, now
         self._without: set[str] = set()
-        self._specs: dict[str, RunSpec | None] = {}
+        self._specs: dict[tuple[str, str], RunSpec | None] = {}  # by their JSON and hash
         self._free = 1
 
     @property
@@ -198,7 +198,7 @@ class QueueSource:
         found: Claims = {}
         for claim in claims:
             assert claim.previous is not None
-            spec = self._specs[claim.previous.spec_json]
+            spec = self._specs[_key(claim.previous)]
             assert spec is not None
             found[Cell(spec, claim.previous.seed)] = claim
         return found, []
@@ -215,13 +215,14 @@ class QueueSource:
 
     def _most(self, row: RunRow, waiting: int) -> int:
         """Return how many seeds of the run's spec to take; 0 if the spec is not to be computed here, which is noted."""
-        if row.spec_json not in self._specs:
+        key = _key(row)
+        if key not in self._specs:
             spec = _valid_spec(row)
             reason = "its spec is not valid, or does not fit its hash" if spec is None else self._objection(spec)
-            self._specs[row.spec_json] = None if reason else spec
+            self._specs[key] = None if reason else spec
             if reason:
                 _LOG.warning("run %s is left in the queue: %s", row.name, reason)
-        spec = self._specs[row.spec_json]
+        spec = self._specs[key]
         if spec is None:
             return 0
         together = min(math.ceil(waiting / self._free), _MOST_TOGETHER) if trains_together(spec) else 1
@@ -241,6 +242,10 @@ class QueueSource:
             if not full.is_relative_to(Path.cwd().resolve()) and full not in self._own_files:
                 return f"its data {path} is not in this folder; give --data {path} to allow that"
         return None
+
+
+def _key(row: RunRow) -> tuple[str, str]:
+    return row.spec_json, row.spec_hash
 
 
 def _valid_spec(row: RunRow) -> RunSpec | None:

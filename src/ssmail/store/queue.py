@@ -7,8 +7,9 @@ from the queue has an owner that begins with QUEUE; when its process stops or di
 import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import StrEnum
+from itertools import count
 from typing import Any
 
 from sqlalchemy import Connection, Engine, Select, delete, insert, select, text, update
@@ -56,7 +57,9 @@ class Queue:
             lock_cells(connection)
             connection.execute(text(_INDEX))
             now = queries.clock(connection)
-            return [self._add(connection, spec, seed, now) for spec, seed in cells]
+            # a microsecond apart, so that they are taken in this order
+            times = (now + timedelta(microseconds=place) for place in count())
+            return [self._add(connection, *cell, time) for cell, time in zip(cells, times, strict=False)]
 
     def _add(self, connection: Connection, spec: RunSpec, seed: int, now: datetime) -> Enqueued:
         newest = queries.newest_of_cell(connection, spec.hash(), seed)
@@ -133,12 +136,12 @@ class Queue:
                     _leave_to(connection, first, newest)
                     continue
                 same = (run.c.spec_hash == first.spec_hash, run.c.state == RunState.QUEUED)
-                count = most(first, queries.count_rows(connection, run, *same))
-                if count == 0:
+                wanted = most(first, queries.count_rows(connection, run, *same))
+                if wanted == 0:
                     without.add(run_id)
                     continue
                 others = queries.runs(connection, *same, run.c.id != run_id, run.c.id.not_in(without))
-                claims = [_take(connection, row, now) for row in (first, *others[: count - 1])]
+                claims = [_take(connection, row, now) for row in (first, *others[: wanted - 1])]
                 return [claim for claim in claims if isinstance(claim, Claim)]
         return []
 
