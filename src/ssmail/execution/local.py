@@ -214,7 +214,8 @@ class _Pool:
         """Send the heartbeats of runs whose processes are still loading."""
         loading = [claim for worker in self._workers for claim in worker.not_begun()]
         if loading and time.monotonic() >= self._next_heartbeat:
-            self._store.queue.heartbeat(loading)
+            with suppress(SsmailError):  # the process meets the same error, and reports it
+                self._store.queue.heartbeat(loading)
             self._next_heartbeat = time.monotonic() + self._settings.heartbeat_seconds
 
     def _release(self, claim: Claim, error: str | None = None) -> bool:

@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Protocol
@@ -87,7 +87,7 @@ class SweepSource:
         while self._groups and free and not claims:
             group = self._groups.pop(0)
             wanted = [(cell.spec, cell.seed) for cell in group]
-            taken = self._store.queue.claim(wanted, partial(self._may_take, group[0].spec), repeat=self._repeat)
+            taken = self._claim(wanted, partial(self._may_take, group[0].spec))
             for cell, found in zip(group, taken, strict=True):
                 if isinstance(found, Claim):
                     claims[cell] = found
@@ -108,6 +108,14 @@ class SweepSource:
         events += [_stopped(cell, f"left to another process on {row.host}") for cell, row in self._elsewhere.items()]
         self._groups, self._elsewhere, self._news = [], {}, []
         return events
+
+    def _claim(self, wanted: Sequence[tuple[RunSpec, int]], may_take: Callable[[RunRow], bool]) -> list[Claim | RunRow]:
+        """Claim cells in the database of this name, which is made anew if it has been removed meanwhile."""
+        store = Store.open(self._store.url, stale_seconds=self._store.stale_seconds)
+        try:
+            return store.queue.claim(wanted, may_take, repeat=self._repeat)
+        finally:
+            store.close()
 
     def _may_take(self, spec: RunSpec, row: RunRow) -> bool:
         """Whether to compute an unfinished run: not if it failed in another process since this one began."""
