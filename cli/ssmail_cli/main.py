@@ -24,6 +24,7 @@ from ssmail_cli import (
     reproduce,
     runs,
     train,
+    work_queue,
 )
 from ssmail_cli.command_group import Commands
 from ssmail_cli.guesses import unknown_option
@@ -60,6 +61,8 @@ app.command("ablate")(train.ablate)
 app.command("ablate-alpha", cls=train.AblateAlias, help="Short for `ssmail ablate alpha`.")(train.ablate)
 app.command("ablate-beta", cls=train.AblateAlias, help="Short for `ssmail ablate beta`.")(train.ablate)
 app.command("reproduce")(reproduce.reproduce)
+app.command("worker")(work_queue.worker)
+app.command("queue")(work_queue.queue)
 app.command("report")(report.report)
 app.command("claims")(claims.claims)
 app.command("explain")(explain.explain)

@@ -189,6 +189,9 @@ DeviceOption = Annotated[
         autocompletion=lambda: list(DEVICES),
     ),
 ]
+Enqueue = Annotated[
+    bool, typer.Option("--enqueue", help="Put the runs into the queue of the database for `ssmail worker`, and end.")
+]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would run, and train nothing.")]
 
 # Drawing

@@ -56,6 +56,27 @@ def _legend(sweep: Sweep) -> str:
     return f"columns: run, epochs done, val ({' or '.join(errors)}) and losses in training, time left"
 
 
+class _AnyCell(dict["Cell", str]):
+    """The label of any cell."""
+
+    def __missing__(self, cell: "Cell") -> str:
+        return printable(label(describe(cell)))
+
+
+def worker_log() -> Report:
+    """Return a function that logs each event of cells that are not known beforehand."""
+    return _Log(_AnyCell())
+
+
+def describe(cell: "Cell") -> dict[str, Any]:
+    """Return what tells a cell from any other: method, environment, settings and seed."""
+    from ssmail.config.changes import changes, with_changes
+
+    spec = cell.spec
+    settings = with_changes(spec.profile, changes(spec.model_dump()))
+    return {"method": spec.method, "env": spec.environment, "profile": settings, "seed": cell.seed}
+
+
 class _Log:
     """Plain lines: the start and end of each run, and about LOG_LINES of its epochs if there are at most FEW runs.
 
@@ -155,6 +176,8 @@ class _RunningRuns:
             _update(self._progress, self._tasks[event.cell], event)
         elif event.is_final:
             self._end(event)
+        elif event.kind == "elsewhere":
+            note(f"{self._labels[event.cell]}: {_headline(event)}")
         else:
             if event.cell not in self._tasks:
                 task = self._progress.add_task(self._labels[event.cell], total=event.epochs, start=False, status="")
@@ -180,8 +203,8 @@ class _RunningRuns:
 
 
 def _update(progress: "Progress", task: "TaskID", event: "Event") -> None:
-    if event.kind == "loading":
-        progress.update(task, status="loading")
+    if event.kind in ("loading", "elsewhere"):
+        progress.update(task, status="loading" if event.kind == "loading" else _headline(event))
     elif event.kind in ("started", "resumed"):
         progress.reset(task, completed=event.epoch, status=_headline(event), before=event.epoch)
     elif event.kind == "epoch":
@@ -199,6 +222,7 @@ def _headline(event: "Event") -> str:
         "started": f"started{run}",
         "resumed": f"resumed after epoch {event.epoch}{run}",
         "skipped": f"skipped: {event.message}",
+        "elsewhere": event.message,
         "finished": f"finished{run}" + ("" if error is None else f": test error {error:.4g}"),
     }
     return printable(words.get(event.kind, f"{event.kind}{run}"))

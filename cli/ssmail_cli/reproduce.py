@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ssmail.evaluation.statistics import Statistic
     from ssmail.execution.cells import Cell
     from ssmail.paper.report.drawing import Drawn
-    from ssmail.store import RunRow, Store
+    from ssmail.store import Store
 
 SEEDS, FEWER_SEEDS = "0-4", {"smoke": "0-1"}  # with which a smoke ends within five minutes on two cores
 PLAN_COLUMNS = {"figure": "figure", "runs": "runs", "stored": "stored", "new": "new", "time": "time"}
@@ -202,12 +202,8 @@ def _train(
     The data has the defaults of `ssmail prep-mocap`. Raises InputError when a file of the CMU database is missing or
     damaged, and typer.Exit when interrupted.
     """
-    from ssmail.execution.local import wait_for_others
     from ssmail.execution.planning import check_labels, longest_first
     from ssmail.store import Store
-
-    def on_wait(run: "RunRow") -> None:
-        note(f"waiting up to half a minute for another process, running or recently killed, to release run {run.name}")
 
     needed = _trainable(figures, data)
     sweep = {cell: needed[cell] for cell in longest_first(list(needed), _seconds(needed, db))}
@@ -216,7 +212,6 @@ def _train(
         with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
             prep_mocap(source=cmu, out=Path(path))
     store = noting_damage(Store.open(db))
-    wait_for_others(store, sweep, on_wait)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
     if is_interrupted(rows):
         finish(sweep, rows)

@@ -3,15 +3,16 @@
 A sweep is a dictionary from each cell to what tells it from the others: {"beta": 0.15, "seed": 2}.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ssmail.errors import ExitCode, InputError, sentence
+from ssmail.errors import ExitCode, InputError, command_line, sentence
 from ssmail.execution import Resume
 from ssmail.plots.formatting import counted, duration, listed, spans
-from ssmail_cli.options import is_missing, noting_damage
+from ssmail_cli.options import database_words, is_missing, noting_damage
 from ssmail_cli.output import Format, chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
 from ssmail_cli.run_table import key_metrics, rows_with_metrics
@@ -35,6 +36,28 @@ def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, a
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
     print_results(rows, sweep, chosen_format(as_json, None))
     return rows
+
+
+def enqueue(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
+    """Let every cell wait in the store for `ssmail worker`, and print what became of each."""
+    from ssmail.execution.planning import check_labels
+    from ssmail.store import Store
+
+    if resume is not Resume.AUTO:
+        raise InputError(f"--enqueue is for --resume auto, not {resume}; train without --enqueue for that.")
+    check_labels(sweep)
+    store = noting_damage(Store.open(db))
+    became = store.queue.add([(cell.spec, cell.seed) for cell in sweep])
+    rows = [
+        {**names, "action": str(action), "spec_hash": cell.spec.hash()}
+        for (cell, names), action in zip(sweep.items(), became, strict=True)
+    ]
+    count = Counter(map(str, became))
+    note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}; {', '.join(f'{n} {name}' for name, n in count.items())}")
+    print_rows(rows, {**_name_columns(sweep), "action": "cell", "spec_hash": "spec"}, chosen_format(as_json, None))
+    if "queued" in count:
+        command = command_line("ssmail", "worker", *database_words(db))
+        note(f"`{command}` computes them, in any number of terminals; `ssmail queue` shows them")
 
 
 def announce(store: "Store", sweep: Sweep, jobs: int, resume: Resume) -> None:
@@ -160,7 +183,10 @@ def print_plan(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
 
 
 def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | None]]":
-    """Return "new", "skip" or "resume" for each cell, and the id of its stored run; no database is created."""
+    """Return "new", "skip", "resume" or "wait" (for another process) for each cell, and the id of its stored run.
+
+    No database is created.
+    """
     from ssmail.execution.planning import check_labels, plan_cell
     from ssmail.store import Store
 
@@ -173,7 +199,9 @@ def plan(sweep: Sweep, db: str, resume: Resume) -> "dict[Cell, tuple[str, str | 
     actions: dict[Cell, tuple[str, str | None]] = {}
     for cell in sweep:
         found = plan_cell(store, cell, resume)
-        if found.skipped:
+        if found.elsewhere and found.row:
+            actions[cell] = "wait", found.row.id
+        elif found.skipped:
             actions[cell] = "skip", found.skipped.run_id
         else:
             actions[cell] = ("resume", found.row.id) if found.row else ("new", None)

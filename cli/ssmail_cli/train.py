@@ -17,7 +17,7 @@ from ssmail.plots.formatting import counted
 from ssmail_cli import completion, options
 from ssmail_cli.options import parse_seeds, pick_device
 from ssmail_cli.output import note
-from ssmail_cli.sweep import finish, is_interrupted, print_plan, train_sweep
+from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
 
 if TYPE_CHECKING:
     from ssmail.config.experiments import Axis
@@ -45,6 +45,7 @@ def train(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
@@ -52,7 +53,8 @@ def train(
     """Train methods with one or several seeds.
 
     A spec and a seed make a run: finished runs are skipped, unfinished ones resumed. Several methods or environments
-    make one sweep, whose specs are all checked before the first run begins. Ctrl-C saves and stops.
+    make one sweep, whose specs are all checked before the first run begins. Ctrl-C saves and stops. The same command in
+    several terminals shares the runs among them.
     """
     from ssmail.config.experiments import build_spec
     from ssmail.execution.cells import Cell
@@ -68,6 +70,9 @@ def train(
         sweep |= {Cell(spec, seed): {**labels, "seed": seed} for seed in chosen_seeds}
     if dry_run:
         print_plan(sweep, db, resume, as_json)
+        return
+    if enqueue_only:
+        enqueue(sweep, db, resume, as_json)
         return
     finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json))
 
@@ -107,6 +112,7 @@ def ablate(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
     db: options.Database = options.DEFAULT_DATABASE,
@@ -131,6 +137,9 @@ def ablate(
     }
     if dry_run:
         print_plan(sweep, db, resume, as_json)
+        return
+    if enqueue_only:
+        enqueue(sweep, db, resume, as_json)
         return
     rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
     if sys.stdout.isatty() and not is_interrupted(rows):

@@ -41,6 +41,8 @@ def test_the_commands_are_those_of_the_documentation() -> None:
         "ablate-alpha",
         "ablate-beta",
         "reproduce",
+        "worker",
+        "queue",
         "report",
         "plot",
         *(f"plot fig{number}" for number in range(1, 10)),

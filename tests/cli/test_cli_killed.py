@@ -50,7 +50,6 @@ def test_killed_ten_times_with_training_that_takes_no_time(
 
     monkeypatch.chdir(tmp_path)
     needs(monkeypatch, tmp_path, fig4=["ssail", "gail", "wail"])
-    monkeypatch.setattr("ssmail.execution.local.wait_for_others", lambda *_: None)  # a killed process is dead here
     monkeypatch.setattr("ssmail.execution.local.run_cells", run_cells)
 
     def reproduce(folder: str) -> int:

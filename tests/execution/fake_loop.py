@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from ssmail.config.spec import RunSpec
+from ssmail.errors import InputError
 from ssmail.training.loop import Divergence
 
 
@@ -163,3 +164,19 @@ class Slow(Walk):
         if self.seed == 0:
             time.sleep(1)
         return super().run_epoch()
+
+
+class Stuck(Walk):
+    """Its second epoch takes longer than anyone waits."""
+
+    def run_epoch(self) -> dict[str, float]:
+        if self.epoch == 1:
+            time.sleep(600)
+        return super().run_epoch()
+
+
+class Unsteady(Walk):
+    """Cannot even begin."""
+
+    def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
+        raise InputError("planted: no such data")

@@ -164,10 +164,10 @@ def test_children_of_a_killed_parent_interrupt_themselves(store: Store, cells: l
     assert row.error.startswith("stopped after epoch")  # by itself, not given up as silent
 
 
-def test_a_cell_in_other_hands_is_refused_before_anything_starts(store: Store, cells: list[Cell]) -> None:
+def test_a_new_run_of_a_cell_in_other_hands_is_refused_before_anything_starts(store: Store, cells: list[Cell]) -> None:
     store.start_run(cells[2].spec, 2, dataset_hash=None, device="cpu")
     with pytest.raises(InputError, match="seed 2 of this spec is being computed by another process"):
-        compute(store, cells, Walk)
+        compute(store, cells, Walk, resume=Resume.NEVER)
     assert [row.seed for row in store.runs()] == [2]
 
 

@@ -124,7 +124,6 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_set(tmp_path / "shelf" / "mocap.npz")
     write_subject(tmp_path / "shelf" / "subject", {1: 101, 2: 151, 3: 60, 4: 110})
     (tmp_path / "shelf" / "empty.db").touch()
-    monkeypatch.setattr("ssmail.execution.local.wait_for_others", lambda *_: None)
     monkeypatch.setattr("ssmail.execution.local.run_cells", train_here)
     return tmp_path
 

@@ -38,6 +38,6 @@ def test_both_engines_have_the_same_limits(engine: str, request: pytest.FixtureR
 
 def test_sqlite_itself_has_no_such_limit_but_the_server_has(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control for the limits: without the check, the server answers with an error of its own."""
-    monkeypatch.setattr("ssmail.store.run_store.require_fitting", lambda *_: None)
+    monkeypatch.setattr("ssmail.store.queue.require_fitting", lambda *_: None)
     with pytest.raises(SsmailError, match="value too long for type character varying"):
         start(remote, named(65))

@@ -8,8 +8,11 @@ from typing import Any, Literal, Self
 from ssmail.config.spec import RunSpec
 from ssmail.execution import Resume
 from ssmail.store import HEARTBEAT_SECONDS
+from ssmail.store.queue import Claim
 
-Kind = Literal["loading", "started", "resumed", "skipped", "epoch", "finished", "failed", "diverged", "interrupted"]
+Kind = Literal[
+    "elsewhere", "loading", "started", "resumed", "skipped", "epoch", "finished", "failed", "diverged", "interrupted"
+]
 NO_LONGER_STORED = "its run is no longer in the database: it was deleted, or the database replaced, meanwhile"
 """What became of a run that ended well but is not stored."""
 _FINAL = ("skipped", "finished", "failed", "diverged", "interrupted")
@@ -27,9 +30,10 @@ class Cell:
 class Event:
     """Something that happened to a cell.
 
-    loading: the process of the cell has been started, and imports torch. epoch: the number of completed epochs, out of
-    `epochs`. metrics: those of the epoch, or of the final evaluation. bad_input: the cell failed before its run started
-    because of the user's input; `message` explains why.
+    elsewhere: another process computes the cell, as `message` says. loading: the process of the cell has been started,
+    and imports torch. epoch: the number of completed epochs, out of `epochs`. metrics: those of the epoch, or of the
+    final evaluation. bad_input: the cell failed before its run started because of the user's input; `message` explains
+    why.
     """
 
     kind: Kind
@@ -75,10 +79,12 @@ class Job:
     seeds: tuple[int, ...]
     store_url: str
     settings: RunSettings
+    claims: tuple[Claim, ...] = ()  # of the seeds, in their order
 
     def as_line(self) -> str:
         """Return the job as one line of JSON."""
         parts: dict[str, Any] = {"seeds": self.seeds, "store_url": self.store_url, "settings": asdict(self.settings)}
+        parts["claims"] = [(claim.run_id, claim.owner) for claim in self.claims]
         return json.dumps({**parts, "spec": json.loads(self.spec.as_json())})
 
     @classmethod
@@ -86,7 +92,8 @@ class Job:
         """Return the job that `as_line` wrote."""
         parts = json.loads(line)
         settings = RunSettings(**{**parts["settings"], "resume": Resume(parts["settings"]["resume"])})
-        return cls(RunSpec.model_validate(parts["spec"]), tuple(parts["seeds"]), parts["store_url"], settings)
+        claims = tuple(Claim(*claim) for claim in parts["claims"])
+        return cls(RunSpec.model_validate(parts["spec"]), tuple(parts["seeds"]), parts["store_url"], settings, claims)
 
     @property
     def cells(self) -> list[Cell]:

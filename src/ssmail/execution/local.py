@@ -11,17 +11,18 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import NO_LONGER_STORED, Cell, Event, Job, Kind, RunSettings
-from ssmail.execution.planning import check_labels, plan_cell, shares
+from ssmail.execution.planning import check_labels, plan_cell
+from ssmail.execution.sources import QueueSource, Source, SweepSource
 from ssmail.store import HEARTBEAT_SECONDS, RunRow, RunState, Store
+from ssmail.store.queue import Claim
 
 WORKER = (sys.executable, "-P", "-m", "ssmail.execution.worker")
 """The command that starts a worker process. Tests replace it to compute cells with a training loop of their own."""
@@ -45,25 +46,24 @@ def run_cells(
     """Compute every cell in at most `jobs` processes, and return the final event of each, in the order of `cells`.
 
     Seeds of a spec share a process where their method can train several at once (`planning.shares`). `on_event` is
-    called in this process with every event, including final ones. A failing cell does not affect the others; a process
-    that dies ends all its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell
+    called in this process with every event, including final ones. Any number of processes may be given the same cells:
+    each is computed once, by the process that claims it first, and is skipped in the others once it has ended; a cell
+    whose process stops or dies is taken over. A failing cell does not affect the others; a process that dies ends all
+    its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell
     finishes its epoch and is marked interrupted; a second signal kills the workers, which loses only their current
-    epoch. Raises InputError, and computes nothing, when another process is computing one of the cells, when `resume` is
-    REQUIRE and there is nothing to resume, when a label function is broken, or when the first cell cannot start because
-    of its input.
+    epoch. Raises InputError, and computes nothing, when `resume` is NEVER and another process is computing one of the
+    cells, when it is REQUIRE and there is nothing to resume, when a label function is broken, or when the first cell
+    cannot start because of its input.
     """
     check_labels(cells)
     store = Store.open(store_url)
     try:
-        plans = [plan_cell(store, cell, resume) for cell in cells]
-        pool = _Pool(store, RunSettings(device, resume), jobs, on_event, worker)
-        waiting = []
-        for cell, plan in zip(cells, plans, strict=True):
+        plans = {cell: plan_cell(store, cell, resume) for cell in cells}
+        source = SweepSource(store, {cell: plan for cell, plan in plans.items() if not plan.skipped}, jobs, resume)
+        pool = _Pool(store, source, _settings(store, device, resume), jobs, on_event, worker)
+        for plan in plans.values():
             if plan.skipped is not None:
                 pool.emit(plan.skipped)
-            else:
-                waiting.append(cell)
-        pool.waiting = shares(waiting, jobs)
         with _counted_signals(pool):
             pool.run()
         return [pool.results[cell] for cell in cells]
@@ -71,35 +71,36 @@ def run_cells(
         store.close()
 
 
-def wait_for_others(
-    store: Store, cells: Iterable[Cell], on_wait: Callable[[RunRow], None], grace_seconds: float = HEARTBEAT_SECONDS
-) -> None:
-    """Wait until no process is computing any of the cells, for at most `store.stale_seconds + grace_seconds`.
+def run_waiting(
+    source: QueueSource,
+    *,
+    store: Store,
+    on_event: Callable[[Event], None],
+    jobs: int = 1,
+    device: str = "cpu",
+    worker: Sequence[str] = WORKER,
+) -> tuple[list[Event], bool]:
+    """Compute cells that wait in the database, in at most `jobs` processes, until the source ends.
 
-    The workers of a command that was killed stop after their epoch. If they were killed too, they count as alive until
-    they have been silent for `store.stale_seconds`. A process that is still at work after that belongs to another
-    command, which `run_cells` reports as an error. `on_wait` is called once, with a run that is waited for.
+    Returns the final event of each, in the order in which they ended, and whether a signal stopped them. A cell that is
+    stopped, by a signal or because the time of the source is over, waits again.
     """
-    waiting = list(cells)
-    deadline = time.monotonic() + store.stale_seconds + grace_seconds
-    reported = False
-    while True:
-        rows = {cell: store.find_cell(cell.spec.hash(), cell.seed) for cell in waiting}
-        alive = {cell: row for cell, row in rows.items() if row is not None and store.is_alive(row)}
-        if not alive or time.monotonic() >= deadline:
-            return
-        if not reported:
-            on_wait(next(iter(alive.values())))
-            reported = True
-        waiting = list(alive)
-        time.sleep(_POLL_SECONDS)
+    pool = _Pool(store, source, _settings(store, device, Resume.AUTO), jobs, on_event, worker)
+    pool.raises_bad_input = False
+    with _counted_signals(pool):
+        pool.run()
+    return list(pool.results.values()), pool.stop_signals > 0
+
+
+def _settings(store: Store, device: str, resume: Resume) -> RunSettings:
+    return RunSettings(device, resume, min(HEARTBEAT_SECONDS, store.stale_seconds / 4))
 
 
 class _Worker:
-    """A worker process and the last event of each of its cells."""
+    """A worker process, its claims, and the last event of each of its cells."""
 
     def __init__(self, job: Job, command: Sequence[str]) -> None:
-        self.spec = job.spec
+        self.spec, self.claims = job.spec, dict(zip(job.cells, job.claims, strict=True))
         self.last = {cell: Event("started", cell, None, 0, job.spec.epochs) for cell in job.cells}
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `wait`)
         self._buffer = b""
@@ -126,6 +127,10 @@ class _Worker:
         self.last |= {event.cell: event for event in events}
         return events if data else None
 
+    def not_begun(self) -> list[Claim]:
+        """Return the claims of cells whose runs the process has neither begun nor given up."""
+        return [self.claims[cell] for cell, last in self.last.items() if last.run_id is None and not last.is_final]
+
     def ask_to_stop(self) -> None:
         with suppress(BrokenPipeError):
             self._stdin.close()
@@ -148,57 +153,85 @@ class _Pool:
     def __init__(
         self,
         store: Store,
+        source: Source,
         settings: RunSettings,
         jobs: int,
         on_event: Callable[[Event], None],
         command: Sequence[str],
     ) -> None:
-        self.waiting: list[list[Cell]] = []
+        self.raises_bad_input = True  # of the first cell
         self.results: dict[Cell, Event] = {}
         self.stop_signals = 0
-        self._store, self._settings, self._jobs, self._on_event = store, settings, jobs, on_event
+        self._store, self._source, self._settings, self._jobs = store, source, settings, jobs
+        self._on_event, self._next_heartbeat = on_event, 0.0
         self._command = command
         self._workers: list[_Worker] = []
         self._selector = selectors.DefaultSelector()
-        self._any_started = False
 
     def emit(self, event: Event) -> None:
         """Pass an event to `on_event`, and keep it if it is final."""
         if event.is_final:
             self.results[event.cell] = event
-        self._any_started = self._any_started or event.kind in ("started", "resumed")
+        if event.kind in ("started", "resumed"):
+            self.raises_bad_input = False
         self._on_event(event)
 
     def run(self) -> None:
-        """Compute all waiting cells. Never leaves a worker behind, even after an exception."""
+        """Compute what the source has. Never leaves a worker or a claim behind, even after an exception."""
         try:
-            while self.waiting or self._workers:
+            while self._workers or not self._source.ended:
                 self._start_workers()
                 for key, _ in self._selector.select(_POLL_SECONDS):
                     self._receive(key.data)
+                self._keep_claims()
                 self._handle_signals()
         finally:
             for worker in self._workers:
                 worker.ask_to_stop()
             for worker in self._workers:
                 worker.wait()
+                for claim in worker.claims.values():
+                    self._release(claim)  # if its run was not begun
             self._selector.close()
 
     def _start_workers(self) -> None:
-        while self.waiting and len(self._workers) < self._jobs and not self.stop_signals:
-            cells = self.waiting.pop(0)
+        while not self.stop_signals:
+            claims, news = self._source.take(self._jobs - len(self._workers))
+            for event in news:
+                self.emit(event)
+            if not claims:
+                return
+            cells = list(claims)
             seeds = tuple(cell.seed for cell in cells)
-            worker = _Worker(Job(cells[0].spec, seeds, self._store.url, self._settings), self._command)
+            job = Job(cells[0].spec, seeds, self._store.url, self._settings, tuple(claims.values()))
+            worker = _Worker(job, self._command)
             self._workers.append(worker)
             self._selector.register(worker.stdout, selectors.EVENT_READ, worker)
             for cell in cells:
                 self._on_event(Event("loading", cell, None, 0, cell.spec.epochs))
 
+    def _keep_claims(self) -> None:
+        """Send the heartbeats of runs whose processes are still loading."""
+        loading = [claim for worker in self._workers for claim in worker.not_begun()]
+        if loading and time.monotonic() >= self._next_heartbeat:
+            with suppress(SsmailError):  # the process meets the same error, and reports it
+                self._store.queue.heartbeat(loading)
+            self._next_heartbeat = time.monotonic() + self._settings.heartbeat_seconds
+
+    def _release(self, claim: Claim, error: str | None = None) -> bool:
+        with suppress(SsmailError):  # the database may be gone
+            return self._store.queue.release(claim, error)
+        return False
+
     def _receive(self, worker: _Worker) -> None:
         events = worker.read()
         for event in events or ():
-            if event.bad_input and not self._any_started:
+            if event.is_final and event.run_id is None:
+                self._release(worker.claims[event.cell], event.message if event.kind == "failed" else None)
+            if event.bad_input and self.raises_bad_input:
                 raise InputError(event.message)
+            if event.kind == "failed" and (row := self._now_of_another(worker.claims[event.cell])):
+                event = self._source.lost(event.cell, row)
             if event.kind in ("finished", "diverged") and not self._store.still_stored([str(event.run_id)]):
                 event = replace(event, kind="failed", message=NO_LONGER_STORED)
             self.emit(event)
@@ -206,25 +239,32 @@ class _Pool:
             self._selector.unregister(worker.stdout)
             self._workers.remove(worker)
             ended = worker.wait()
-            for last in worker.last.values():
+            for cell, last in worker.last.items():
                 if not last.is_final:
-                    self._report_dead_run(last, ended)
+                    self._report_dead_run(last, worker.claims[cell], ended)
 
-    def _report_dead_run(self, last: Event, ended: str) -> None:
-        stopped = self.stop_signals > 0
-        if last.run_id is not None:
+    def _now_of_another(self, claim: Claim) -> RunRow | None:
+        """Return the row of the claimed run if another process has taken it over and is computing it."""
+        with suppress(SsmailError):
+            row = self._store.run(claim.run_id)
+            if row.owner != claim.owner and self._store.is_alive(row):
+                return row
+        return None
+
+    def _report_dead_run(self, last: Event, claim: Claim, ended: str) -> None:
+        stopped = self.stop_signals > 0 or self._source.out_of_time
+        if last.run_id is not None or not self._release(claim, None if stopped else ended):
+            state = RunState.INTERRUPTED if stopped else RunState.FAILED
             with suppress(SsmailError):  # the database may be gone, too
-                self._store.end_dead_run(last.run_id, RunState.INTERRUPTED if stopped else RunState.FAILED, ended)
+                self._store.end_dead_run(claim.run_id, state, ended, claim.owner)
         kind: Kind = "interrupted" if stopped else "failed"
         self.emit(Event(kind, last.cell, last.run_id, last.epoch, last.epochs, message=ended))
 
     def _handle_signals(self) -> None:
-        if not self.stop_signals:
+        if not self.stop_signals and not self._source.out_of_time:
             return
-        for cell in chain.from_iterable(self.waiting):
-            epochs = cell.spec.epochs
-            self.emit(Event("interrupted", cell, None, 0, epochs, message="stopped before it started"))
-        self.waiting.clear()
+        for event in self._source.stop():
+            self.emit(event)
         for worker in self._workers:
             worker.ask_to_stop()
             if self.stop_signals > 1:

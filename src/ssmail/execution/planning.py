@@ -19,10 +19,14 @@ from ssmail.store.checkpoint_files import LASTS
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do with a cell: skip it (`skipped` is its event), resume `row`, or start a new run if both are None."""
+    """What to do with a cell: skip it (`skipped` is its event), resume `row`, or start a new run if both are None.
+
+    elsewhere: another process is computing `row`.
+    """
 
     skipped: Event | None = None
     row: RunRow | None = None
+    elsewhere: bool = False
 
 
 def check_labels(cells: Iterable[Cell]) -> None:
@@ -37,14 +41,16 @@ def check_labels(cells: Iterable[Cell]) -> None:
 def plan_cell(store: Store, cell: Cell, resume: Resume) -> Plan:
     """Decide what to do with a cell, given the stored runs.
 
-    Raises InputError when another process is computing the cell, when REQUIRE finds nothing to resume, or when the data
-    file of a finished cell has changed.
+    Raises InputError when a new run is wanted of a cell that another process is computing, when REQUIRE finds nothing
+    to resume, or when the data file of a finished cell has changed.
     """
     row = store.find_cell(cell.spec.hash(), cell.seed)
-    if row is not None:
-        store.require_idle(row)
     if resume is Resume.NEVER:
+        if row is not None:
+            store.require_idle(row)
         return Plan()
+    if row is not None and store.is_alive(row):
+        return Plan(row=row, elsewhere=True)
     if row is not None and row.state.settled:
         _check_data(cell, row)
         epochs = cell.spec.epochs
@@ -78,12 +84,12 @@ def shares(cells: Sequence[Cell], jobs: int) -> list[list[Cell]]:
         by_spec.setdefault(cell.spec, []).append(cell)
     divided = []
     for spec, own in by_spec.items():
-        size = math.ceil(len(own) / jobs) if _trains_together(spec) else 1
+        size = math.ceil(len(own) / jobs) if trains_together(spec) else 1
         divided += [own[first : first + size] for first in range(0, len(own), size)]
     return divided
 
 
-def _trains_together(spec: RunSpec) -> bool:
+def trains_together(spec: RunSpec) -> bool:
     """Whether a process can train several seeds of the spec at once: small networks of an adversarial method.
 
     With sac.encoder_steps, every seed has a window of its own; and the many edges of recorded motion leave nothing to

@@ -6,6 +6,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,6 +19,7 @@ from ssmail.execution.cells import Cell, Event, Kind, RunSettings
 from ssmail.execution.planning import Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
 from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
+from ssmail.store.queue import Claim
 from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
 
@@ -61,8 +63,11 @@ def run_together(
     on_event: Callable[[Event], None],
     should_stop: Callable[[], bool],
     make_loop: MakeLoop = TrainingLoop,
+    claims: Mapping[Cell, Claim] = MappingProxyType({}),
 ) -> None:
     """Compute seeds of one spec, epoch by epoch, all at once; pass every event to `on_event`, also the final ones.
+
+    claims: the runs to begin or resume; a cell without one is planned and claimed here.
 
     A seed ends by itself: its divergence or failure does not affect the others. Seeds that were interrupted at
     different epochs catch up first. `should_stop` is called between epochs. Once it returns True, the runs are marked
@@ -75,7 +80,7 @@ def run_together(
         return
     runs = []
     for cell in cells:
-        started = _start(cell, store, settings, make_loop)
+        started = _start(cell, store, settings, make_loop, claims.get(cell))
         if isinstance(started, Event):
             on_event(started)
         else:
@@ -85,35 +90,40 @@ def run_together(
         _train([run for run in runs if run.attempt(run.record_snapshot, on_event)], on_event, should_stop)
 
 
-def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop) -> "_Run | Event":
+def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop, claim: Claim | None) -> "_Run | Event":
     """Start or resume the run of a cell, or return its final event if there is nothing to train."""
     try:
-        plan = plan_cell(store, cell, settings.resume)
+        plan = Plan(row=store.run(claim.run_id)) if claim else plan_cell(store, cell, settings.resume)
         if plan.skipped is not None:
             return plan.skipped
         if settings.device.startswith("cuda") and not torch.cuda.is_available():
             raise InputError("PyTorch finds no CUDA device on this machine; use --device cpu")
         loop = make_loop(cell.spec, cell.seed, settings.device)
-        writer = _open_run(cell, store, settings, plan, loop)
-        return _Run(cell, loop, writer, resumed=plan.row is not None)
+        writer = _open_run(cell, store, settings, plan, loop, claim)
+        return _Run(cell, loop, writer, resumed=plan.row is not None and plan.row.has_begun)
     except Exception as error:
         bad_input = isinstance(error, InputError)
         return Event("failed", cell, None, 0, cell.spec.epochs, message=_summary(error), bad_input=bad_input)
 
 
-def _open_run(cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop: Loop) -> RunWriter:
+def _open_run(
+    cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop: Loop, claim: Claim | None
+) -> RunWriter:
     """Start a new run, or resume the planned one and load its last checkpoint into `loop`."""
     if plan.row is None:
         repeat = settings.resume is Resume.NEVER
         return store.start_run(
             cell.spec, cell.seed, dataset_hash=loop.dataset_hash, device=settings.device, repeat=repeat
         )
+    if not plan.row.has_begun:
+        begun = {"dataset_hash": loop.dataset_hash, "device": settings.device}
+        return store.resume_run(plan.row.id, 0, claim, **begun)
     if plan.row.dataset_hash != loop.dataset_hash:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
     _load_last(store, plan.row.id, loop)
-    return store.resume_run(plan.row.id, loop.epoch)
+    return store.resume_run(plan.row.id, loop.epoch, claim)
 
 
 def _load_last(store: Store, run_id: str, loop: Loop) -> None:

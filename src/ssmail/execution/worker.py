@@ -40,8 +40,9 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
 
     torch.set_num_threads(1)
     job = Job.from_line(line)
-    store = Store.open(job.store_url)
-    run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop)
+    store = Store.open(job.store_url, patience=120)  # seconds in which a server may come back
+    claims = dict(zip(job.cells, job.claims, strict=True))
+    run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop, claims)
 
 
 def _read_line() -> bytes:

@@ -85,16 +85,23 @@ class RunRow:
         return with_changes(self.profile, self.changes)
 
     @property
-    def silent_seconds(self) -> float:
-        """Seconds since the last heartbeat; negative if the clock was set back since, or another machine's is ahead."""
-        return (datetime.now(UTC) - self.heartbeat).total_seconds()
+    def has_begun(self) -> bool:
+        """Whether the run has read its data; until then, it holds nothing."""
+        return self.dataset_hash is not None
 
-    def is_alive(self, stale_seconds: float = STALE_SECONDS) -> bool:
+    def silent_seconds(self, now: datetime | None = None) -> float:
+        """Return the seconds from the last heartbeat to `now`; negative if the clock was set back since.
+
+        `now` is the time of the database's clock (`clock`), by default that of this machine.
+        """
+        return ((now or datetime.now(UTC)) - self.heartbeat).total_seconds()
+
+    def is_alive(self, stale_seconds: float = STALE_SECONDS, now: datetime | None = None) -> bool:
         """Return whether the run is RUNNING and its last heartbeat is less than `stale_seconds` away from now.
 
         One further in the future was sent before the clock was set back: a process at work would have sent others.
         """
-        return self.state is RunState.RUNNING and abs(self.silent_seconds) < stale_seconds
+        return self.state is RunState.RUNNING and abs(self.silent_seconds(now)) < stale_seconds
 
 
 @dataclass(frozen=True)
@@ -161,21 +168,33 @@ def refuse(damaged: Iterable[DamagedRow]) -> None:
         raise InputError(f"run {row.run} is damaged ({row.place}{row.reason}); `ssmail db check` shows what to do")
 
 
+def clock(connection: Connection) -> datetime:
+    """Return the time of the database's clock, by which heartbeats are written and judged.
+
+    SQLite is used by the processes of one machine; those of several machines, whose clocks differ, ask the server.
+    """
+    if connection.dialect.name == "sqlite":
+        return datetime.now(UTC)
+    now: datetime = connection.execute(select(func.clock_timestamp())).scalar_one()
+    return now.astimezone(UTC)
+
+
 def silent_runs(
     connection: Connection, stale_seconds: float = STALE_SECONDS, *, for_update: bool = False
 ) -> list[RunRow]:
     """Return the RUNNING runs that are not alive (see RunRow.is_alive)."""
-    now, stale = datetime.now(UTC), timedelta(seconds=stale_seconds)
+    now, stale = clock(connection), timedelta(seconds=stale_seconds)
     heartbeat = schema.run.c.heartbeat
     silent = (heartbeat < now - stale) | (heartbeat > now + stale)
     return runs(connection, schema.run.c.state == RunState.RUNNING, silent, for_update=for_update)
 
 
 def newest_of_cell(connection: Connection, spec_hash: str, seed: int, *, for_update: bool = False) -> RunRow | None:
-    """Return the newest run of the cell, or None."""
+    """Return the newest run of the cell, or None. One that waits or stopped before it began counts as the oldest."""
     cell = (schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
     found = runs(connection, *cell, for_update=for_update)
-    return found[-1] if found else None
+    begun = [row for row in found if row.has_begun or row.state.settled or row.state is RunState.RUNNING]
+    return next(reversed(begun or found), None)
 
 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:

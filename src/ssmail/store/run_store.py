@@ -1,7 +1,9 @@
 """The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
+import os
 import uuid
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from copy import copy
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,9 +18,10 @@ from ssmail.store import arrays, queries, run_metadata, schema, server
 from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
 from ssmail.store.connection import connect, describe, read, reading, write
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
-from ssmail.store.schema import RunState, in_byte_order, require_fitting
+from ssmail.store.queue import Claim, Queue, end, interrupt, new_row
+from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
-from ssmail.store.writer import RunWriter, drop_metrics_after, end, interrupt
+from ssmail.store.writer import RunWriter, drop_metrics_after
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,13 +46,14 @@ class Store:
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
-    def open(cls, where: str | Path, *, stale_seconds: float = STALE_SECONDS, patience: float = 0.0) -> Self:
+    def open(cls, where: str | Path, *, stale_seconds: float | None = None, patience: float = 0.0) -> Self:
         """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
         patience: how many seconds to wait for a server that cannot be reached.
         Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        return cls(connect(where, patience), stale_seconds)
+        stale = _stale_seconds() if stale_seconds is None else stale_seconds
+        return cls(connect(where, patience), stale)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -85,6 +89,11 @@ class Store:
         self.damaged |= damaged
         return found if self._only is None else [row for row in found if row.id in self._only]
 
+    def run(self, run_id: str) -> RunRow:
+        """Return the run with that full id. Raises InputError when there is none, or its row is damaged."""
+        with reading(self._engine) as connection:
+            return queries.one_run(connection, run_id)
+
     def full_ids(self, ids: Sequence[str]) -> list[str]:
         """Return the full id for each id or prefix, also of a damaged row.
 
@@ -118,12 +127,22 @@ class Store:
 
     def is_alive(self, row: RunRow) -> bool:
         """Return whether a process is computing the run: it is RUNNING and has sent a heartbeat recently."""
-        return row.is_alive(self.stale_seconds)
+        return row.is_alive(self.stale_seconds, self._now())
+
+    def _now(self) -> datetime:
+        with reading(self._engine) as connection:
+            return queries.clock(connection)
+
+    @property
+    def queue(self) -> Queue:
+        """The cells that wait, and who computes which."""
+        return Queue(self._engine, self.stale_seconds)
 
     def require_idle(self, row: RunRow) -> None:
         """Raise InputError when another process is computing the run."""
-        if self.is_alive(row):
-            silent = row.silent_seconds
+        now = self._now()
+        if row.is_alive(self.stale_seconds, now):
+            silent = row.silent_seconds(now)
             when = f"{silent:.0f} s ago" if silent >= 0 else f"{-silent:.0f} s ahead of this clock"
             raise InputError(
                 f"seed {row.seed} of this spec is being computed by another process on {row.host} (run {row.name}, "
@@ -139,31 +158,14 @@ class Store:
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the
         cell, or when the cell has finished or diverged already, unless `repeat` allows a new run beside the old one.
         """
-        run_id, owner = uuid.uuid4().hex, uuid.uuid4().hex
-        row = {
-            "id": run_id,
-            "method": spec.method,
-            "environment": spec.environment,
-            "profile": spec.profile,
-            "seed": seed,
-            "spec_json": spec.as_json(),
-            "spec_hash": spec.hash(),
-            "dataset_hash": dataset_hash,
-            "state": RunState.RUNNING,
-            "owner": owner,
-            "resumes": 0,
-            "device": device,
-            "wall_seconds": 0.0,
-            "cpu_seconds": 0.0,
-            **run_metadata.columns(),
-        }
-        require_fitting(schema.run, [row])
+        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex, datetime.now(UTC))
+        row |= {"dataset_hash": dataset_hash, "device": device}
 
         def start(connection: Connection, again: bool) -> None:
             server.lock_cells(connection)
             newest = queries.newest_of_cell(connection, spec.hash(), seed, for_update=True)
             if newest is not None:
-                if again and newest.id == run_id:
+                if again and newest.id == row["id"]:
                     return
                 self.require_idle(newest)
                 if newest.state.settled and not repeat:
@@ -172,37 +174,41 @@ class Store:
                     )
                 if newest.state is RunState.RUNNING:
                     interrupt(connection, newest)
-            now = datetime.now(UTC)
+            now = queries.clock(connection)
             connection.execute(insert(schema.run), {**row, "started": now, "heartbeat": now})
 
         write(self._engine, start)
-        return RunWriter(self._engine, self.checkpoint_root, run_id, owner)
+        return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"])
 
-    def resume_run(self, run_id: str, from_step: int) -> RunWriter:
+    def resume_run(self, run_id: str, from_step: int, claim: Claim | None = None, **begun: str | None) -> RunWriter:
         """Continue an unfinished run after epoch `from_step`, dropping the metrics of later epochs.
 
+        With a claim of the run, only who made it may do so. begun: its columns dataset_hash and device, if they change.
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the run
         or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
         `from_step`.
         """
-        owner = uuid.uuid4().hex
+        owner = claim.owner if claim else uuid.uuid4().hex
 
         def resume(connection: Connection, again: bool) -> RunRow:
             row = queries.one_run(connection, run_id, for_update=True)
-            if again and row.owner == owner:
+            if again and claim is None and row.owner == owner:
                 return row
-            self.require_idle(row)
+            if claim is None or row.owner != owner:
+                self.require_idle(row)
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
+            before = row if claim is None else claim.previous  # from before an attempt of which the answer was lost
             changes = {
                 "state": RunState.RUNNING,
                 "error": None,
                 "finished": None,
-                "heartbeat": datetime.now(UTC),
+                "heartbeat": queries.clock(connection),
                 "owner": owner,
-                "resumes": row.resumes + 1,
+                "resumes": before.resumes + (claim is None or before.has_begun) if before else 0,
                 **run_metadata.columns(),
+                **begun,
             }
             connection.execute(update(schema.run).where(schema.run.c.id == run_id).values(changes))
             return row
@@ -221,9 +227,9 @@ class Store:
 
         return write(self._engine, mark)
 
-    def end_dead_run(self, run_id: str, state: RunState, error: str) -> None:
-        """Set the state of a RUNNING run whose process is known to be dead; leave a run in any other state alone."""
-        write(self._engine, lambda connection, _: end(connection, run_id, state, error))
+    def end_dead_run(self, run_id: str, state: RunState, error: str, owner: str | None = None) -> None:
+        """Set the state of a RUNNING run, of that owner if one is given, whose process is known to be dead."""
+        write(self._engine, lambda connection, _: end(connection, run_id, state, error, owner))
 
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
@@ -321,3 +327,12 @@ class Store:
     def is_compact(self, run: RunRow) -> bool:
         """Return whether a run that ended has no checkpoint: a compact database keeps only what figures read of it."""
         return run.state.settled and not self.artifacts(run.id)
+
+
+def _stale_seconds() -> float:
+    """Return the value of SSMAIL_STALE_SECONDS, by default STALE_SECONDS. Raises InputError if it is no such number."""
+    text = os.environ.get("SSMAIL_STALE_SECONDS")
+    with suppress(ValueError):
+        if text is None or 0 < float(text) < 1e6:
+            return STALE_SECONDS if text is None else float(text)
+    raise InputError(f"SSMAIL_STALE_SECONDS is {shortened(str(text), 40)!r}; give a number of seconds above 0")

@@ -23,9 +23,9 @@ def is_run_id(value: object) -> bool:
 
 
 class RunState(StrEnum):
-    """The state of a run. Only a RUNNING run can be written to; INTERRUPTED and FAILED runs can be resumed.
+    """The state of a run. Only a RUNNING run can be written to; QUEUED, INTERRUPTED and FAILED runs can be resumed.
 
-    Nothing sets QUEUED yet: it is part of the schema for the planned work queues, and such a run can be resumed.
+    A QUEUED run waits for any process to compute it; see `ssmail.store.queue`.
     """
 
     QUEUED = "queued"

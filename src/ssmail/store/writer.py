@@ -9,7 +9,6 @@ import hashlib
 import math
 import time
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from ssmail.store import arrays, queries, run_metadata, schema
 from ssmail.store.checkpoint_files import run_folder
 from ssmail.store.connection import write
 from ssmail.store.queries import RunRow
+from ssmail.store.queue import left_state
 from ssmail.store.schema import RunState, require_fitting
 
 
@@ -91,23 +91,28 @@ class RunWriter:
         self._replace(schema.artifact, [{"run_id": self.run_id, **row, "sha256": hashlib.sha256(content).hexdigest()}])
 
     def finish(self, state: RunState, error: str | None = None) -> None:
-        """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards."""
+        """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards.
+
+        A run from the queue that is INTERRUPTED waits again.
+        """
         if state in (RunState.QUEUED, RunState.RUNNING):
             raise SsmailError(f"a run cannot end in the state {state}")
+        if state is RunState.INTERRUPTED:
+            state = left_state(self._owner)
         error = error and error.replace("\0", "\\0")  # which a server does not store
 
         def end(connection: Connection, again: bool) -> None:
             mine = (schema.run.c.id == self.run_id) & (schema.run.c.owner == self._owner)
             stored = connection.execute(select(schema.run.c.state).where(mine)).scalar() if again else None
             if stored != state:
-                self._touch(connection, state=state, error=error, finished=datetime.now(UTC))
+                self._touch(connection, state=state, error=error, finished=queries.clock(connection))
 
         write(self._engine, end)
 
     def _touch(self, connection: Connection, **changes: Any) -> None:
         run = schema.run
         mine = (run.c.id == self.run_id) & (run.c.owner == self._owner) & (run.c.state == RunState.RUNNING)
-        values = {"heartbeat": datetime.now(UTC), **self._resources(), **changes}
+        values = {"heartbeat": queries.clock(connection), **self._resources(), **changes}
         if connection.execute(update(run).where(mine).values(values)).rowcount == 1:
             return
         state = connection.execute(select(run.c.state).where(run.c.id == self.run_id)).scalar()
@@ -171,23 +176,6 @@ def _value(value: float) -> dict[str, Any]:
     if math.isfinite(number):
         return {"value": number, "kind": "finite"}
     return {"value": None, "kind": "nan" if math.isnan(number) else "inf" if number > 0 else "-inf"}
-
-
-def interrupt(connection: Connection, row: RunRow) -> None:
-    """Mark a run whose process is silent as INTERRUPTED."""
-    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
-    ahead = row.silent_seconds < 0
-    error = (
-        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
-    )
-    end(connection, row.id, RunState.INTERRUPTED, error)
-
-
-def end(connection: Connection, run_id: str, state: RunState, error: str) -> None:
-    """End a run whose process is dead or silent; leave one alone that is in another state than RUNNING."""
-    running = (schema.run.c.id == run_id) & (schema.run.c.state == RunState.RUNNING)
-    values = {"state": state, "error": error, "finished": datetime.now(UTC)}
-    connection.execute(update(schema.run).where(running).values(values))
 
 
 def drop_metrics_after(connection: Connection, row: RunRow, step: int) -> None:

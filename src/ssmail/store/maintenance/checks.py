@@ -179,8 +179,9 @@ def _silent(connection: Connection) -> Iterator[Problem]:
 
 def _checkpoints(url: URL, connection: Connection, runs: Sequence[RunRow]) -> Iterator[Problem]:
     """Check that the recorded files exist with the recorded content; those of a run at work change meanwhile."""
+    now = queries.clock(connection)
     for run in runs:
-        if run.is_alive():
+        if run.is_alive(now=now):
             continue
         for row in queries.artifacts(connection, run.id, checkpoint_root(url)):
             if wrong := fault_of(row):

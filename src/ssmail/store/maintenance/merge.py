@@ -182,11 +182,12 @@ def decide_fates(here: Connection, there: Connection, without: Collection[str] =
     cells: dict[tuple[str, int, str | None], list[RunRow]] = {}
     for run in ours:
         cells.setdefault(run.cell, []).append(run)
+    here_now, there_now = queries.clock(here), queries.clock(there)
     merged = []
     for run in (run for run in queries.runs(there) if run.id not in without):
         rivals = [by_id[run.id]] if run.id in by_id else cells.get(run.cell, [])
         settled = [rival for rival in rivals if rival.state.settled]
-        if any(item.is_alive() for item in (run, *rivals)):
+        if run.is_alive(now=there_now) or any(rival.is_alive(now=here_now) for rival in rivals):
             merged.append(MergedRun(run, Fate.BUSY))
         elif not rivals:
             merged.append(MergedRun(run, Fate.ADDED))

@@ -1,0 +1,150 @@
+"""`ssmail worker` computes what waits in the database; `ssmail queue` shows it."""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ssmail.errors import ExitCode, InputError
+from ssmail.plots.formatting import counted, duration
+from ssmail_cli import options
+from ssmail_cli.options import is_missing, noting_damage, pick_device
+from ssmail_cli.output import chosen_format, note, print_rows
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from ssmail.store import RunRow, Store
+
+COLUMNS = {
+    "run": "run",
+    "cell": "cell",
+    "method": "method",
+    "environment": "env",
+    "settings": "profile",
+    "seed": "seed",
+    "host": "host",
+    "since": "since",
+}
+
+
+def worker(
+    max_cells: Annotated[
+        int | None, typer.Option("--max-cells", min=1, help="End after so many runs.", show_default="any number")
+    ] = None,
+    max_hours: Annotated[
+        float | None,
+        typer.Option(
+            "--max-hours",
+            help="After so many hours, give back the runs in progress at the end of their epoch, and end.",
+            show_default="any time",
+        ),
+    ] = None,
+    idle_exit: Annotated[
+        float | None,
+        typer.Option(
+            "--idle-exit",
+            metavar="SECONDS",
+            help="End when nothing has waited for so many seconds; 0: as soon as nothing waits.",
+            show_default="never",
+        ),
+    ] = None,
+    jobs: options.Jobs = 1,
+    device: options.DeviceOption = options.AUTO,
+    data: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--data", metavar="FILE", help="A data file outside the current folder that runs may read; repeatable."
+        ),
+    ] = None,
+    as_json: options.Json = False,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
+    """Compute the runs that wait in the queue of the database.
+
+    `ssmail train ... --enqueue` puts them there; start any number of workers, at any time. Ctrl-C gives the runs in
+    progress back to the queue after their epoch; those of a worker that dies are taken over by others. Runs whose spec
+    names a Python function are left alone unless SSMAIL_EXPERIMENTS is set.
+    """
+    from ssmail.execution.local import run_waiting
+    from ssmail.execution.sources import QueueSource
+    from ssmail_cli.progress import describe, worker_log
+    from ssmail_cli.sweep import finish, print_results, result_rows
+
+    for name, value in (("--max-hours", max_hours), ("--idle-exit", idle_exit)):
+        if value is not None and not 0 <= value < math.inf:
+            raise InputError(f"{name} takes a number that is not negative, not {value}.")
+    store = _open(db)
+    source = QueueSource(store, max_cells, max_hours, idle_exit, data or ())
+    chosen = pick_device(device)
+    events, stopped = run_waiting(source, store=store, on_event=worker_log(), jobs=jobs, device=chosen)
+    sweep = {event.cell: describe(event.cell) for event in events}
+    rows = result_rows(store, sweep, events)
+    if rows:
+        print_results(rows, sweep, chosen_format(as_json, None))
+    else:
+        note("no run was computed")
+    if stopped:
+        note("interrupted; the runs in progress wait in the queue again")
+        raise typer.Exit(ExitCode.INTERRUPTED)
+    ended = {cell: names for (cell, names), row in zip(sweep.items(), rows, strict=True) if _is_over(row)}
+    finish(ended, [row for row in rows if _is_over(row)])
+
+
+def queue(
+    as_json: options.Json = False, form: options.Output = None, db: options.Database = options.DEFAULT_DATABASE
+) -> None:
+    """Show the runs that wait, are being computed, or whose process has died.
+
+    Those that have died are taken over by the next process with the same sweep, or by a worker if they were in the
+    queue.
+    """
+    store = _open(db)
+    runs, now = store.queue.rows()
+    rows = [_row(store, run, now) for run in runs]
+    count = {name: sum(row["cell"] == name for row in rows) for name in ("waiting", "running", "dead")}
+    note(f"{counted(len(rows), 'run')}: {', '.join(f'{number} {name}' for name, number in count.items())}")
+    for row in rows:
+        row["since"] = duration(max(0.0, row["seconds"]))
+    print_rows(rows, COLUMNS, chosen_format(as_json, form))
+
+
+def _row(store: "Store", run: "RunRow", now: "datetime") -> dict[str, Any]:
+    """Return a run as a row; its seconds are those since it was put into the queue, began, or fell silent."""
+    from ssmail.store import RunState
+
+    if run.state is RunState.QUEUED:
+        cell, seconds = "waiting", (now - run.started).total_seconds()
+    elif run.is_alive(store.stale_seconds, now):
+        cell, seconds = "running", (now - run.started).total_seconds()
+    else:
+        cell, seconds = "dead", run.silent_seconds(now)
+    return {
+        "run": run.name,
+        "cell": cell,
+        "method": run.method,
+        "environment": run.environment,
+        "settings": run.settings,
+        "seed": run.seed,
+        "host": None if cell == "waiting" else run.host,
+        "seconds": round(seconds, 1),
+        "id": run.id,
+        "spec_hash": run.spec_hash,
+    }
+
+
+def _is_over(row: dict[str, Any]) -> bool:
+    """Whether a run has ended, or was left to another process; otherwise it waits again, after --max-hours."""
+    return row["outcome"] not in ("interrupted", "skipped")
+
+
+def _open(db: str) -> "Store":
+    """Open the store as it is: what is dead is shown, and taken over, as such."""
+    from ssmail.store import Store
+
+    if is_missing(db):
+        raise InputError(
+            f"there is no database {db}; `ssmail train ... --enqueue` makes one, or name another with --db."
+        )
+    return noting_damage(Store.open(db))

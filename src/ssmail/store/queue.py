@@ -1,0 +1,289 @@
+"""Which process computes which cell: cells that wait, and claims, each decided in one write transaction.
+
+A claim makes the newest run of a cell RUNNING, or inserts one, for a process that will begin it. A run that was taken
+from the queue has an owner that begins with QUEUE; when its process stops or dies, it waits again, for anyone.
+"""
+
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+from itertools import count
+from typing import Any
+
+from sqlalchemy import Connection, Engine, Select, delete, insert, select, text, update
+
+from ssmail.config.spec import RunSpec
+from ssmail.store import queries, run_metadata, schema, server
+from ssmail.store.connection import read, write
+from ssmail.store.queries import RunRow
+from ssmail.store.schema import RunState, require_fitting
+
+QUEUE = "queue"
+_NOBODY = QUEUE.ljust(32, "-")
+_INDEX = "CREATE INDEX IF NOT EXISTS run_waiting ON run (state, started, id)"
+"""Made with the first queue: a database of an earlier ssmail needs no upgrade, and an earlier ssmail still opens it."""
+
+
+class Enqueued(StrEnum):
+    """What became of a cell that was put into the queue."""
+
+    QUEUED = "queued"
+    WAITING = "waiting"  # it was in the queue already
+    RUNNING = "running"  # a process is computing it
+    STORED = "stored"  # it has finished or diverged
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A run that this process may begin, and its row from before the claim, which is None for a new one."""
+
+    run_id: str
+    owner: str
+    previous: RunRow | None = None
+
+
+class Queue:
+    """The cells of a database as processes share them. Get it from `Store.queue`."""
+
+    def __init__(self, engine: Engine, stale_seconds: float) -> None:
+        self._engine, self._stale_seconds = engine, stale_seconds
+
+    def add(self, cells: Sequence[tuple[RunSpec, int]]) -> list[Enqueued]:
+        """Let the cells (spec and seed) wait, and return what became of each. An unfinished run waits to be resumed."""
+
+        def add(connection: Connection, _again: bool) -> list[Enqueued]:
+            server.lock_cells(connection)
+            connection.execute(text(_INDEX))
+            now = queries.clock(connection)
+            # a microsecond apart, so that they are taken in this order
+            times = (now + timedelta(microseconds=place) for place in count())
+            return [self._add(connection, *cell, time) for cell, time in zip(cells, times, strict=False)]
+
+        return write(self._engine, add)
+
+    def _add(self, connection: Connection, spec: RunSpec, seed: int, now: datetime) -> Enqueued:
+        newest = queries.newest_of_cell(connection, spec.hash(), seed)
+        if newest is None:
+            row = new_row(spec, seed, RunState.QUEUED, _NOBODY, now)
+            connection.execute(insert(schema.run), row)
+        elif newest.state.settled:
+            return Enqueued.STORED
+        elif newest.state is RunState.QUEUED:
+            return Enqueued.WAITING
+        elif newest.is_alive(self._stale_seconds, now):
+            return Enqueued.RUNNING
+        else:
+            changes = {"state": RunState.QUEUED, "owner": _NOBODY, "finished": None}
+            connection.execute(update(schema.run).where(_unchanged(newest)).values(changes))
+        return Enqueued.QUEUED
+
+    def claim(
+        self, cells: Sequence[tuple[RunSpec, int]], may_take: Callable[[RunRow], bool], *, repeat: bool = False
+    ) -> list[Claim | RunRow]:
+        """Claim those of the cells (spec and seed) that nobody computes and that have not ended.
+
+        Returns a claim for each, or the newest run of a cell that was not claimed: it has ended, another process is
+        computing it, or `may_take` is False for it. repeat: claim a new run beside one that has ended or stopped.
+        """
+
+        def claim(connection: Connection, _again: bool) -> list[Claim | RunRow]:
+            server.lock_cells(connection)
+            now = queries.clock(connection)
+            return [self._claim(connection, spec, seed, now, may_take, repeat) for spec, seed in cells]
+
+        return write(self._engine, claim)
+
+    def _claim(
+        self,
+        connection: Connection,
+        spec: RunSpec,
+        seed: int,
+        now: datetime,
+        may_take: Callable[[RunRow], bool],
+        repeat: bool,
+    ) -> Claim | RunRow:
+        newest = queries.newest_of_cell(connection, spec.hash(), seed)
+        if newest is not None and newest.is_alive(self._stale_seconds, now):
+            return newest
+        if newest is not None and not repeat:
+            if newest.state.settled:
+                _forget_waiting(connection, newest)
+                return newest
+            return _take(connection, newest, now) if may_take(newest) else newest
+        if newest is not None and newest.state is RunState.RUNNING:
+            interrupt(connection, newest)
+        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex, now)
+        connection.execute(insert(schema.run), row)
+        return Claim(row["id"], row["owner"])
+
+    def claim_waiting(self, most: Callable[[RunRow, int], int], without: set[str]) -> list[Claim]:
+        """Claim the run that has waited longest, and others of its spec if `most` allows several; none if none waits.
+
+        `most` says how many to claim of a spec, given its first run and how many of its runs wait. The ids of runs that
+        cannot be used, because it says 0 or their rows are damaged, are added to `without`, whose runs are left alone.
+        Runs that were taken from the queue by a process that has died wait again.
+        """
+        run = schema.run
+
+        def claim(connection: Connection, _again: bool) -> list[Claim]:
+            now = queries.clock(connection)
+            for row in queries.silent_runs(connection, self._stale_seconds):
+                if row.owner.startswith(QUEUE):
+                    interrupt(connection, row)
+            while (run_id := connection.execute(longest_waiting(without)).scalar()) is not None:
+                first = next(iter(queries.runs(connection, run.c.id == run_id)), None)
+                if first is None:  # damaged
+                    without.add(run_id)
+                    continue
+                newest = queries.newest_of_cell(connection, first.spec_hash, first.seed)
+                if newest is not None and newest.id != first.id:  # a merge or --resume never brought another run
+                    _leave_to(connection, first, newest)
+                    continue
+                same = (run.c.spec_hash == first.spec_hash, run.c.state == RunState.QUEUED)
+                wanted = most(first, queries.count_rows(connection, run, *same))
+                if wanted == 0:
+                    without.add(run_id)
+                    continue
+                others = queries.runs(connection, *same, run.c.id != run_id, run.c.id.not_in(without))
+                claims = [_take(connection, row, now) for row in (first, *others[: wanted - 1])]
+                return [claim for claim in claims if isinstance(claim, Claim)]
+            return []
+
+        return write(self._engine, claim)
+
+    def heartbeat(self, claims: Sequence[Claim]) -> None:
+        """Record that the process which made these claims is alive."""
+        run = schema.run
+        mine = run.c.id.in_([item.run_id for item in claims]) & run.c.owner.in_([item.owner for item in claims])
+        alive = update(run).where(mine, run.c.state == RunState.RUNNING)
+
+        def record(connection: Connection, _again: bool) -> None:
+            connection.execute(alive.values(heartbeat=queries.clock(connection)))
+
+        write(self._engine, record)
+
+    def release(self, claim: Claim, error: str | None = None) -> bool:
+        """Undo a claim unless its run was begun or is no longer ours; return whether it was undone.
+
+        A run from the queue that could not begin has failed, by `error`.
+        """
+        run, before = schema.run, claim.previous
+        mine = (run.c.id == claim.run_id) & (run.c.owner == claim.owner) & (run.c.state == RunState.RUNNING)
+        mine &= (
+            run.c.dataset_hash.is_(None) if before is None or not before.has_begun else run.c.resumes == before.resumes
+        )
+
+        def undo(connection: Connection, _again: bool) -> bool:
+            if before is None:
+                return connection.execute(delete(run).where(mine)).rowcount == 1
+            names = ("state", "error", "finished", "started", "owner", "heartbeat")
+            values = {name: getattr(before, name) for name in names}
+            if error is not None and before.state is RunState.QUEUED:
+                values |= {"state": RunState.FAILED, "error": error, "finished": queries.clock(connection)}
+            return connection.execute(update(run).where(mine).values(values)).rowcount == 1
+
+        return write(self._engine, undo)
+
+    def rows(self) -> tuple[list[RunRow], datetime]:
+        """Return the runs that wait or are running, the oldest first, and the time of the database's clock."""
+        states = schema.run.c.state.in_([RunState.QUEUED, RunState.RUNNING])
+        return read(self._engine, lambda connection: (queries.runs(connection, states), queries.clock(connection)))
+
+
+def longest_waiting(without: set[str]) -> Select[Any]:
+    """Return the query for the id of the run that has waited longest, but those; it reads one entry of the index."""
+    run = schema.run
+    query = select(run.c.id).where(run.c.state == RunState.QUEUED)
+    if without:
+        query = query.where(run.c.id.not_in(without))
+    return query.order_by(run.c.started, run.c.id).limit(1).with_for_update(skip_locked=True)
+
+
+def new_row(spec: RunSpec, seed: int, state: RunState, owner: str, now: datetime) -> dict[str, Any]:
+    """Return the columns of a new run of the cell, which has not read its data yet.
+
+    Raises InputError if one is too long for its column.
+    """
+    row = {
+        "id": uuid.uuid4().hex,
+        "method": spec.method,
+        "environment": spec.environment,
+        "profile": spec.profile,
+        "seed": seed,
+        "spec_json": spec.as_json(),
+        "spec_hash": spec.hash(),
+        "dataset_hash": None,
+        "state": state,
+        "started": now,
+        "heartbeat": now,
+        "owner": owner,
+        "resumes": 0,
+        "device": "cpu",
+        "wall_seconds": 0.0,
+        "cpu_seconds": 0.0,
+        **run_metadata.columns(),
+    }
+    require_fitting(schema.run, [row])
+    return row
+
+
+def interrupt(connection: Connection, row: RunRow) -> None:
+    """Mark a run whose process is silent as INTERRUPTED; one from the queue waits again."""
+    last = f"{row.heartbeat:%Y-%m-%d %H:%M:%S} UTC"
+    ahead = row.silent_seconds(queries.clock(connection)) < 0
+    error = (
+        f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
+    )
+    end(connection, row.id, RunState.INTERRUPTED, error)
+
+
+def end(connection: Connection, run_id: str, state: RunState, error: str, owner: str | None = None) -> None:
+    """End a RUNNING run, of that owner if one is given; one from the queue that is INTERRUPTED waits again."""
+    run = schema.run
+    running = (run.c.id == run_id) & (run.c.state == RunState.RUNNING)
+    if owner is not None:
+        running &= run.c.owner == owner
+    if state is RunState.INTERRUPTED:
+        state = left_state(str(connection.execute(select(run.c.owner).where(running)).scalar()))
+    values = {"state": state, "error": error, "finished": queries.clock(connection)}
+    connection.execute(update(run).where(running).values(values))
+
+
+def left_state(owner: str) -> RunState:
+    """Return the state of a run that its owner leaves before its end."""
+    return RunState.QUEUED if owner.startswith(QUEUE) else RunState.INTERRUPTED
+
+
+def _take(connection: Connection, row: RunRow, now: datetime) -> Claim | RunRow:
+    """Claim an existing run; return its row if another process was faster, which only a server allows."""
+    token = uuid.uuid4().hex
+    from_queue = row.state is RunState.QUEUED or row.owner.startswith(QUEUE)
+    owner = QUEUE + token[len(QUEUE) :] if from_queue else token
+    changes = {"state": RunState.RUNNING, "owner": owner, "heartbeat": now, "finished": None}
+    if not row.has_begun:
+        changes["started"] = now
+    taken = connection.execute(update(schema.run).where(_unchanged(row)).values(changes)).rowcount == 1
+    return Claim(row.id, owner, row) if taken else row
+
+
+def _unchanged(row: RunRow) -> Any:
+    run = schema.run
+    return (run.c.id == row.id) & (run.c.owner == row.owner) & (run.c.state == row.state)
+
+
+def _forget_waiting(connection: Connection, newest: RunRow) -> None:
+    """Delete the runs of a settled cell that only wait, and hold nothing."""
+    run = schema.run
+    same = (run.c.spec_hash == newest.spec_hash) & (run.c.seed == newest.seed)
+    connection.execute(delete(run).where(same, run.c.state == RunState.QUEUED, run.c.dataset_hash.is_(None)))
+
+
+def _leave_to(connection: Connection, row: RunRow, newest: RunRow) -> None:
+    """Take a run out of the queue whose cell has a newer one; it is deleted only if it never began."""
+    if row.has_begun:
+        left = {"state": RunState.INTERRUPTED, "error": f"its cell has a newer run, {newest.name}"}
+        connection.execute(update(schema.run).where(_unchanged(row)).values(left))
+    else:
+        connection.execute(delete(schema.run).where(_unchanged(row)))
