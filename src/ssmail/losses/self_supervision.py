@@ -8,7 +8,6 @@ expert: tau_alpha = (1 - alpha) * tau_G + alpha * tau_E (docs/paper.md). The lab
 from collections.abc import Sequence
 
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 
@@ -50,6 +49,8 @@ def assignment(generated: Tensor, experts: Tensor) -> Tensor:
     neglects one of the expert's modes, some generated trajectories are paired with that mode; if it covers all modes as
     the expert does, the pairs are those of `nearest`.
     """
+    from scipy.optimize import linear_sum_assignment  # half a second to import, in every process that trains
+
     distances = torch.cdist(generated.flatten(1), experts.flatten(1)).square().nan_to_num(nan=1e30, posinf=1e30)
     _, columns = linear_sum_assignment(distances.cpu().numpy())
     return torch.as_tensor(columns, device=generated.device)

@@ -189,6 +189,7 @@ class Store:
         `from_step`.
         """
         owner = claim.owner if claim else uuid.uuid4().hex
+        claimed = self.run(run_id) if claim else None
 
         def resume(connection: Connection, again: bool) -> RunRow:
             row = queries.one_run(connection, run_id, for_update=True)
@@ -199,14 +200,14 @@ class Store:
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
-            before = row if claim is None else claim.previous  # from before an attempt of which the answer was lost
+            before = claimed or row  # as it was before an attempt of which the answer was lost
             changes = {
                 "state": RunState.RUNNING,
                 "error": None,
                 "finished": None,
                 "heartbeat": queries.clock(connection),
                 "owner": owner,
-                "resumes": before.resumes + (claim is None or before.has_begun) if before else 0,
+                "resumes": before.resumes + (claim is None or before.has_begun),
                 **run_metadata.columns(),
                 **begun,
             }
