@@ -27,7 +27,7 @@ autodoc_typehints_format = "short"
 autodoc_default_options = {
     "members": True,
     "ignore-module-all": True,  # what a package exports is documented where it is defined
-    "exclude-members": "cache_ok, impl, model_config",  # of SQLAlchemy and pydantic
+    "exclude-members": "cache_ok, impl, inherit_cache, model_config",  # of SQLAlchemy and pydantic
 }
 python_maximum_signature_line_length = 100
 

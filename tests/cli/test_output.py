@@ -21,6 +21,7 @@ ALLOWED = {
     "cli/ssmail_cli/output.py",
     "src/ssmail/data/mocap/download.py",  # prints without a command line
     "src/ssmail/config/experiments_file.py",  # logs which file is in use,
+    "src/ssmail/execution/sources.py",  # and which run is left in the queue,
     "cli/ssmail_cli/main.py",  # and notes what is logged
 }
 
