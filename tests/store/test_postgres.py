@@ -15,6 +15,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunState, RunWriter, Store, connection, server
 from ssmail.store.connection import as_url, describe, make_engine, write
+from ssmail.store.queue import Claim
 from tests.store.databases import SPEC, add
 from tests.store.postgres_server import PASSWORD, Server
 
@@ -311,3 +312,23 @@ def test_runs_are_deleted_with_all_they_recorded(remote: Store) -> None:
     assert remote.metrics([run]).empty
     assert not (remote.checkpoint_root / run).exists()
     assert PASSWORD not in remote.where
+
+
+def test_runs_that_wait_are_claimed_once_and_those_of_a_silent_worker_again(remote: Store, url: str) -> None:
+    remote.queue.add([(SPEC, seed) for seed in range(24)])
+
+    def claim_all(_: int) -> list[Claim]:
+        own, claims = Store.open(url), []
+        while found := own.queue.claim_waiting(lambda row, waiting: 2, set()):
+            claims += found
+        own.close()
+        return claims
+
+    with ThreadPoolExecutor(8) as pool:
+        claims = [claim for found in pool.map(claim_all, range(8)) for claim in found]
+    assert sorted(claim.run_id for claim in claims) == sorted(row.id for row in remote.runs(state="running"))
+    assert len(claims) == 24
+    assert remote.queue.claim_waiting(lambda row, waiting: 24, set()) == []
+    impatient = Store.open(url, stale_seconds=1e-6)
+    assert len(impatient.queue.claim_waiting(lambda row, waiting: 24, set())) == 24
+    impatient.close()
