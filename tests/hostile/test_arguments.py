@@ -80,6 +80,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         return [Event("failed", cell, None, 0, 1, message="not trained") for cell in cells]
 
     monkeypatch.setattr(local, "run_cells", run_cells)
+    monkeypatch.setattr("ssmail.execution.local.run_waiting", lambda *_, **__: ([], False))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "file.txt").write_text("a file")
@@ -117,6 +118,8 @@ def lines(draw: st.DrawFn) -> list[str]:
 def test_any_options_of_any_command(folder: Path, words: list[str]) -> None:
     if words[0] == "prep-mocap":
         words = [*words, "--source", "file.txt"]
+    if words[0] == "worker":  # by default it waits for work until it is stopped
+        words = [*words, "--idle-exit", "0"]
     hold(folder, *words)
 
 
