@@ -232,18 +232,21 @@ def is_missing(database: str) -> bool:
         raise InputError(f"{shortened(database, 120)} is no path of a database ({reason}); give another --db") from None
 
 
-def open_store(database: str) -> "Store":
+def open_store(
+    database: str,
+    made_by: str = "ssmail train --method ssail --profile quick --seeds 0-4",
+    mark_dead: bool = True,
+) -> "Store":
     """Open the store for reading, after marking runs whose process has died as interrupted, where possible.
 
-    Raises InputError when the file does not exist: reading must not create it.
+    Raises InputError, which says what makes a database, when the file does not exist: reading must not create it.
     """
     from ssmail.store import Store
 
     if is_missing(database):
-        command = "ssmail train --method ssail --profile quick --seeds 0-4"
-        raise InputError(f"there is no database {database}; `{command}` makes one, or name another with --db.")
+        raise InputError(f"there is no database {database}; `{made_by}` makes one, or name another with --db.")
     store = noting_damage(Store.open(database))
-    if not all(store.is_alive(row) for row in store.runs(state="running")):
+    if mark_dead and not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()
     return store

@@ -9,7 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError
 from ssmail.plots.formatting import counted, duration
 from ssmail_cli import options
-from ssmail_cli.options import is_missing, noting_damage, pick_device
+from ssmail_cli.options import open_store, pick_device
 from ssmail_cli.output import chosen_format, note, print_rows
 
 if TYPE_CHECKING:
@@ -27,6 +27,8 @@ COLUMNS = {
     "host": "host",
     "since": "since",
 }
+
+MADE_BY = "ssmail train ... --enqueue"
 
 
 def worker(
@@ -75,7 +77,7 @@ def worker(
     for name, value in (("--max-hours", max_hours), ("--idle-exit", idle_exit)):
         if value is not None and not 0 <= value < math.inf:
             raise InputError(f"{name} takes a number that is not negative, not {value}.")
-    store = _open(db)
+    store = open_store(db, MADE_BY, mark_dead=False)  # what is dead is shown, or taken over, as such
     source = QueueSource(store, max_cells, max_hours, idle_exit, data or ())
     chosen = pick_device(device)
     events, stopped = run_waiting(source, store=store, on_event=worker_log(), jobs=jobs, device=chosen)
@@ -100,7 +102,7 @@ def queue(
     Those that have died are taken over by the next process with the same sweep, or by a worker if they were in the
     queue.
     """
-    store = _open(db)
+    store = open_store(db, MADE_BY, mark_dead=False)  # what is dead is shown, or taken over, as such
     runs, now = store.queue.rows()
     rows = [_row(store, run, now) for run in runs]
     count = {name: sum(row["cell"] == name for row in rows) for name in ("waiting", "running", "dead")}
@@ -137,14 +139,3 @@ def _row(store: "Store", run: "RunRow", now: "datetime") -> dict[str, Any]:
 def _is_over(row: dict[str, Any]) -> bool:
     """Whether a run has ended, or was left to another process; otherwise it waits again, after --max-hours."""
     return row["outcome"] not in ("interrupted", "skipped")
-
-
-def _open(db: str) -> "Store":
-    """Open the store as it is: what is dead is shown, and taken over, as such."""
-    from ssmail.store import Store
-
-    if is_missing(db):
-        raise InputError(
-            f"there is no database {db}; `ssmail train ... --enqueue` makes one, or name another with --db."
-        )
-    return noting_damage(Store.open(db))

@@ -12,7 +12,7 @@ from sqlalchemy import make_url
 
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store, connection
-from ssmail.store.maintenance import server_database, sqlite_file
+from ssmail.store.maintenance import postgres, sqlite_file
 from ssmail.store.maintenance.checks import check
 from ssmail.store.maintenance.merge import Fate, merge
 from ssmail_cli.main import run
@@ -131,7 +131,7 @@ def test_a_backup_that_pg_dump_refuses_is_one_sentence(url: str, call: Call, mon
     words: list[list[str]] = []
     real = subprocess.run
     monkeypatch.setattr(
-        server_database.subprocess,
+        postgres.subprocess,
         "run",
         lambda command, **options: (
             words.append(command)
@@ -143,7 +143,7 @@ def test_a_backup_that_pg_dump_refuses_is_one_sentence(url: str, call: Call, mon
     assert "(pg_dump: error: server version mismatch); use the pg_dump of the server's version" in err
     assert not Path("copy.dump").exists()
     assert PASSWORD not in " ".join(map(str, words[0]))  # which all users of the machine see
-    monkeypatch.setattr(server_database.shutil, "which", lambda _: None)
+    monkeypatch.setattr(postgres.shutil, "which", lambda _: None)
     assert "pg_dump is not installed; install PostgreSQL's client" in call("db", "backup", "x", "--db", url)[2]
 
 

@@ -30,6 +30,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
     from ssmail.execution.cells import Event, Job
     from ssmail.execution.run_together import run_together
     from ssmail.store import Store
+    from ssmail.store.connection import BUSY_SECONDS
     from ssmail.training.loop import TrainingLoop
 
     def send(event: Event) -> None:
@@ -40,7 +41,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
 
     torch.set_num_threads(1)
     job = Job.from_line(line)
-    store = Store.open(job.store_url, patience=120)  # seconds in which a server may come back
+    store = Store.open(job.store_url, patience=BUSY_SECONDS)
     claims = dict(zip(job.cells, job.claims, strict=True))
     run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop, claims)
 

@@ -66,8 +66,7 @@ class Queue:
     def _add(self, connection: Connection, spec: RunSpec, seed: int, now: datetime) -> Enqueued:
         newest = queries.newest_of_cell(connection, spec.hash(), seed)
         if newest is None:
-            row = new_row(spec, seed, RunState.QUEUED, _NOBODY, now)
-            connection.execute(insert(schema.run), row)
+            insert_row(connection, new_row(spec, seed, RunState.QUEUED, _NOBODY), now)
         elif newest.state.settled:
             return Enqueued.STORED
         elif newest.state is RunState.QUEUED:
@@ -114,8 +113,8 @@ class Queue:
             return _take(connection, newest, now) if may_take(newest) else newest
         if newest is not None and newest.state is RunState.RUNNING:
             interrupt(connection, newest)
-        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex, now)
-        connection.execute(insert(schema.run), row)
+        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex)
+        insert_row(connection, row, now)
         return Claim(row["id"], row["owner"])
 
     def claim_waiting(self, most: Callable[[RunRow, int], int], without: set[str]) -> list[Claim]:
@@ -201,8 +200,8 @@ def longest_waiting(without: set[str]) -> Select[Any]:
     return query.order_by(run.c.started, run.c.id).limit(1).with_for_update(skip_locked=True)
 
 
-def new_row(spec: RunSpec, seed: int, state: RunState, owner: str, now: datetime) -> dict[str, Any]:
-    """Return the columns of a new run of the cell, which has not read its data yet.
+def new_row(spec: RunSpec, seed: int, state: RunState, owner: str) -> dict[str, Any]:
+    """Return the columns, without times, of a new run of the cell, which has not read its data yet.
 
     Raises InputError if one is too long for its column.
     """
@@ -216,8 +215,6 @@ def new_row(spec: RunSpec, seed: int, state: RunState, owner: str, now: datetime
         "spec_hash": spec.hash(),
         "dataset_hash": None,
         "state": state,
-        "started": now,
-        "heartbeat": now,
         "owner": owner,
         "resumes": 0,
         "device": "cpu",
@@ -227,6 +224,11 @@ def new_row(spec: RunSpec, seed: int, state: RunState, owner: str, now: datetime
     }
     require_fitting(schema.run, [row])
     return row
+
+
+def insert_row(connection: Connection, row: dict[str, Any], now: datetime) -> None:
+    """Insert a new run that begins, or begins to wait, at `now`."""
+    connection.execute(insert(schema.run), {**row, "started": now, "heartbeat": now})
 
 
 def interrupt(connection: Connection, row: RunRow) -> None:

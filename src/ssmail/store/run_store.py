@@ -5,12 +5,12 @@ import uuid
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from copy import copy
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy.typing as npt
-from sqlalchemy import Connection, Engine, Table, delete, insert, select, update
+from sqlalchemy import Connection, Engine, Table, delete, select, update
 
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, shortened
@@ -18,7 +18,7 @@ from ssmail.store import arrays, queries, run_metadata, schema, server
 from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
 from ssmail.store.connection import connect, describe, read, reading, write
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
-from ssmail.store.queue import Claim, Queue, end, interrupt, new_row
+from ssmail.store.queue import Claim, Queue, end, insert_row, interrupt, new_row
 from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
 from ssmail.store.writer import RunWriter, drop_metrics_after
@@ -127,7 +127,7 @@ class Store:
 
     def is_alive(self, row: RunRow) -> bool:
         """Return whether a process is computing the run: it is RUNNING and has sent a heartbeat recently."""
-        return row.is_alive(self.stale_seconds, self._now())
+        return row.state is RunState.RUNNING and row.is_alive(self.stale_seconds, self._now())
 
     def _now(self) -> datetime:
         with reading(self._engine) as connection:
@@ -140,8 +140,7 @@ class Store:
 
     def require_idle(self, row: RunRow) -> None:
         """Raise InputError when another process is computing the run."""
-        now = self._now()
-        if row.is_alive(self.stale_seconds, now):
+        if row.state is RunState.RUNNING and row.is_alive(self.stale_seconds, now := self._now()):
             silent = row.silent_seconds(now)
             when = f"{silent:.0f} s ago" if silent >= 0 else f"{-silent:.0f} s ahead of this clock"
             raise InputError(
@@ -158,7 +157,7 @@ class Store:
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the
         cell, or when the cell has finished or diverged already, unless `repeat` allows a new run beside the old one.
         """
-        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex, datetime.now(UTC))
+        row = new_row(spec, seed, RunState.RUNNING, uuid.uuid4().hex)
         row |= {"dataset_hash": dataset_hash, "device": device}
 
         def start(connection: Connection, again: bool) -> None:
@@ -174,8 +173,7 @@ class Store:
                     )
                 if newest.state is RunState.RUNNING:
                     interrupt(connection, newest)
-            now = queries.clock(connection)
-            connection.execute(insert(schema.run), {**row, "started": now, "heartbeat": now})
+            insert_row(connection, row, queries.clock(connection))
 
         write(self._engine, start)
         return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"])

@@ -1,6 +1,6 @@
 """Whole databases: find and open them without upgrading, describe, back up and upgrade them; write new SQLite files.
 
-What only a server has is in `server_database`.
+What only a server has is in `postgres`.
 """
 
 import sqlite3
@@ -26,7 +26,7 @@ from ssmail.store.connection import (
     reading,
     revision_of,
 )
-from ssmail.store.maintenance.server_database import dump, size_of
+from ssmail.store.maintenance.postgres import dump, size_of
 from ssmail.store.queries import count_rows
 from ssmail.store.schema import REVISIONS
 from ssmail.store.server import missing_driver
