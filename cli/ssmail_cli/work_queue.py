@@ -137,5 +137,5 @@ def _row(store: "Store", run: "RunRow", now: "datetime") -> dict[str, Any]:
 
 
 def _is_over(row: dict[str, Any]) -> bool:
-    """Whether a run has ended, or was left to another process; otherwise it waits again, after --max-hours."""
+    """Whether a run ended here: it neither waits again, after --max-hours, nor was taken over by another process."""
     return row["outcome"] not in ("interrupted", "skipped")

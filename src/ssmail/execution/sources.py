@@ -24,7 +24,7 @@ from ssmail.store import RunRow, RunState, Store
 from ssmail.store.queue import Claim
 
 LOOK_SECONDS = 1.0
-"""How often a process with nothing to do looks what the others have done."""
+"""Seconds between two looks at the runs of other processes, or at the queue."""
 _MOST_TOGETHER = 8  # seeds that a worker takes at once, so that something is left for others
 _LOG = logging.getLogger(__name__)
 Claims = dict[Cell, Claim]
@@ -79,7 +79,7 @@ class SweepSource:
         return not self._groups and not self._elsewhere and not self._news
 
     def take(self, free: int) -> tuple[Claims, list[Event]]:
-        """Claim the next cells, and look from time to time what became of those that others compute."""
+        """Claim the next cells, and check at intervals whether the runs of other processes have ended."""
         news, self._news = self._news, []
         if time.monotonic() >= self._next_look:
             news += self._look()
