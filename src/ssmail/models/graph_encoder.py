@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ssmail.models.fast_messages import between_different
 from ssmail.models.linear import Linear
-from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
+from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron, sender_weights
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
 
@@ -146,6 +146,11 @@ def few_way_softmax(x: Tensor) -> Tensor:
 
 
 def edge_entropy(logits: Tensor) -> Tensor:
-    """Return the entropies (...) of edge-type distributions with logits (..., K) in nats, between 0 and log K."""
+    """Return the mean entropy (...) of the edges' types in nats, between 0 and log K, given logits (..., N, N, K).
+
+    The diagonal is no edge; a single agent has none, and the entropy 0.
+    """
+    n = logits.shape[-2]
     log_p = torch.log_softmax(logits.movedim(-1, 0).contiguous(), dim=0)  # the last axis is slow for small K
-    return -(log_p.exp() * log_p).sum(dim=0)
+    entropies = -(log_p.exp() * log_p).sum(dim=0)
+    return (entropies * sender_weights(n, logits).squeeze(-1)).sum(dim=(-2, -1)) / n
