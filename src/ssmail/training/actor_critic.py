@@ -180,8 +180,9 @@ class SoftActorCritic:
         replaced = at_steps(replaced, steps)
         next_graph = at_steps(graphs.detach(), steps + 1)
         if replaced.any():
-            read = self._graphs_of_next(histories, noise, at_steps(next_x, steps), steps, replaced)
-            next_graph = torch.where(replaced[..., None, None, None], read, next_graph)
+            logits = self.policy.encoder.logits_after(x, steps, at_steps(next_x, steps))
+            read = sample_graph(logits, at_steps(noise, steps + 1), self.policy.graph_temperature)
+            next_graph = torch.where(replaced[..., None, None, None], read.round(), next_graph)  # exactly one-hot
         return Transitions(
             x=at_steps(x, steps),
             actions=self.features.normalize_actions(at_steps(batch.actions, steps)),
@@ -201,27 +202,6 @@ class SoftActorCritic:
         _, b, t, n, _ = history.shape
         noise = drawn(self.generators["policy"], lambda g: self.policy.draw_graph_noise(b, t, n, g))
         return noise.to(history.device).expand(-1, b, t, -1, -1, -1)
-
-    @torch.no_grad()
-    def _graphs_of_next(
-        self, histories: Tensor, noise: Tensor, next_x: Tensor, steps: Tensor, wanted: Tensor
-    ) -> Tensor:
-        """Sample the graphs (S, B, C, N, N, K) of histories that end in next_x (S, B, C, N, F), after `steps` (S, C).
-
-        Only those that `wanted` (S, B, C) has for some seed; zeros elsewhere.
-        """
-        s, b, c, n, _ = next_x.shape
-        made = next_x.new_zeros(s, b, c, n, n, self.policy.edge_types)
-        seeds = torch.arange(s, device=next_x.device).unsqueeze(1)
-        for pairs in torch.split(wanted.any(dim=0).nonzero(), b):  # as many trajectories at once as in an update
-            row, column = pairs.unbind(dim=1)
-            at, each = steps[:, column] + 1, torch.arange(len(row), device=next_x.device)
-            sequences = histories[:, row]
-            sequences[seeds, each, at] = next_x[:, row, column]
-            logits, _ = self.policy.encoder(sequences)
-            sampled = sample_graph(logits[seeds, each, at], noise[seeds, row, at], self.policy.graph_temperature)
-            made[:, row, column] = sampled.round()  # exactly one-hot
-        return made
 
     def _graphs(self, history: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Sample graphs (S, B, T, N, N, K) from features (S, B, T, N, F); return them with their entropy (S,) in nats.
