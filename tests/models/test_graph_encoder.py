@@ -91,9 +91,22 @@ def test_the_sample_is_one_hot_and_its_gradient_soft() -> None:
     torch.testing.assert_close(logits.grad, soft.grad)
 
 
-def test_edge_entropy() -> None:
-    torch.testing.assert_close(edge_entropy(torch.zeros(2, 3, 4)), torch.full((2, 3), math.log(4)))
-    assert float(edge_entropy(torch.tensor([50.0, 0.0]))) == pytest.approx(0, abs=1e-6)
+def test_edge_entropy_is_a_mean_over_the_edges() -> None:
+    """Two agents, two edges: one undecided, one with p = 0.2; what stands on the diagonal does not count."""
     p = 0.2
-    logits = torch.tensor([math.log(p), math.log(1 - p)])
-    assert float(edge_entropy(logits)) == pytest.approx(-p * math.log(p) - (1 - p) * math.log(1 - p))
+    decided = [math.log(p), math.log(1 - p)]
+    logits = torch.tensor([[[9.0, 0.0], [0.0, 0.0]], [decided, [0.0, 0.0]]])
+    expected = (math.log(2) - p * math.log(p) - (1 - p) * math.log(1 - p)) / 2
+    assert float(edge_entropy(logits)) == pytest.approx(expected)
+    torch.testing.assert_close(edge_entropy(torch.zeros(2, 5, 3, 3, 4)), torch.full((2, 5), math.log(4)))
+
+
+def test_a_collapsed_graph_has_no_entropy() -> None:
+    """The encoder's logits of the diagonal are zeros: with it in the mean, three agents would have log(2) / 3."""
+    torch.manual_seed(0)
+    encoder = GraphEncoder(4, 6, 2)
+    with torch.no_grad():
+        encoder.head.bias.copy_(torch.tensor([50.0, 0.0]))
+    for agents in (3, 1):
+        logits, _ = encoder(torch.randn(2, 7, agents, 4))
+        assert float(edge_entropy(logits.detach()).max()) == pytest.approx(0, abs=1e-6)

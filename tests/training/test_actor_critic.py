@@ -238,3 +238,25 @@ def test_a_checkpoint_holds_the_average(tmp_path: Path) -> None:
         plain.load_state_dict(load_checkpoint(tmp_path / "last.pt"))
     with pytest.raises(UnfitState, match="actor_critic has other entries"):
         resumed.load_state_dict(plain.state_dict())
+
+
+@pytest.mark.parametrize("steps", [[7, 30], [30, 48]])
+def test_the_next_graph_has_read_the_next_state_of_the_dynamics(steps: list[int]) -> None:
+    """After an intervention at step 31, which the rollout's own graph of that step has read. The last step has none."""
+    sac, generators = (setting := Setting(0, "model.graph_noise=edge")).sac, setting.generators
+    with torch.no_grad():
+        sac.policy.encoder.head.weight.mul_(100)  # so that the graphs depend on what is read
+    batch, _ = setting.training.generate(0.0)
+    batch.states[:, :, 31:] = torch.randn(batch.states[:, :, 31:].shape, generator=torch.Generator().manual_seed(1))
+    generators["policy"].manual_seed(3)
+    at = sac._transitions(batch, torch.tensor([steps]))
+    generators["policy"].manual_seed(3)
+    noise = sac._draw_graph_noise(at.histories)
+    as_stored, _, _ = sac.policy.graphs(at.histories, noise)
+    for place, step in enumerate(steps):
+        history = torch.cat([at.histories[:, :, : step + 1], at.next_x[:, :, place : place + 1]], dim=2)
+        graphs, _, _ = sac.policy.graphs(history, noise[:, :, : step + 2])
+        found = at.next_graph[:, :, place].round()
+        assert torch.equal(found, graphs[:, :, -1].round())
+        unchanged = torch.equal(found, as_stored[:, :, step + 1].round())
+        assert unchanged is (step != 30)  # the negative control

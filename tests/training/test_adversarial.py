@@ -191,7 +191,7 @@ def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
     for steps in (None, 5, 10**6):
         made.actor_critic.spec = made.actor_critic.spec.model_copy(update={"encoder_steps": steps})
         made.generators.seeds[0]["policy"].manual_seed(1)
-        graph, entropy = made.actor_critic._graphs(x)
+        graph, entropy = made.actor_critic._graphs(x, made.actor_critic._draw_graph_noise(x))
         policy.zero_grad()
         (graph * torch.arange(2.0)).sum().backward(retain_graph=True)
         results.append((graph.detach(), entropy.detach(), policy.encoder.head.weight.grad.clone()))

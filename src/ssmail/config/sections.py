@@ -192,7 +192,7 @@ class SacSpec(Frozen):
     """The value after a trajectory's last step is zero, for tasks whose time is an input (model.time_input); otherwise
     the critics bootstrap there, from a time step that they are never trained on."""
     graph_entropy: NonNegative
-    """Weight of the edge types' entropy in the actor's objective."""
+    """Weight of the edge types' entropy in the actor's objective, a mean over the edges."""
     average: Inside | None
     """The policy that is evaluated has weights averaged over the updates, of which each counts this fraction (an
     exponential moving average); null: the current weights."""

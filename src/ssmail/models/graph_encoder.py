@@ -16,8 +16,8 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.fast_messages import between_different
-from ssmail.models.linear import Linear
-from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron
+from ssmail.models.linear import Linear, affine
+from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron, sender_weights
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
 
@@ -55,14 +55,46 @@ class GraphEncoder(nn.Module):
         With the weights of S seeds, all of them have another axis S in front. The logits of step t depend on
         x[:, : t + 1] only.
         """
-        n = x.shape[-2]
+        sequences = self._embed(x)
+        embedded, memory = self.lstm(sequences.flatten(-3, -2), memory)
+        return self._logits(embedded, sequences, x.shape[-2]), memory
+
+    @torch.no_grad()
+    def logits_after(self, x: Tensor, steps: Tensor, next_x: Tensor) -> Tensor:
+        """Return the logits (S, B, C, N, N, K) of histories that end otherwise: with next_x (S, B, C, N, D), which
+        follows x (S, B, T, N, D) after its steps (S, C). For the weights of S seeds.
+        """
+        w_in, w_hidden, b_in, b_hidden = self.lstm.all_weights[0]
+
+        def gated(read: Tensor, hidden: Tensor) -> Sequence[Tensor]:
+            i, f, g, o = (affine(read, w_in, b_in + b_hidden) + affine(hidden, w_hidden, None)).chunk(4, dim=-1)
+            return g.tanh() * i.sigmoid(), f.sigmoid(), o.sigmoid()
+
+        # Only the cell's states are missing in the outputs of the LSTM: c <- f c + i g.
+        sequences = self._embed(x).flatten(-3, -2)  # (S, T, edges, H)
+        hidden, _ = self.lstm(sequences)
+        added, kept, _ = gated(sequences, nn.functional.pad(hidden[:, :-1], (0, 0, 0, 0, 1, 0)))
+        cells = [added[:, 0]]
+        for t in range(1, sequences.shape[1]):
+            cells.append(torch.addcmul(added[:, t], kept[:, t], cells[-1]))
+        # One more step from each of them.
+        seeds = torch.arange(len(x), device=x.device).unsqueeze(1)
+        following = self._embed(next_x)
+        added, kept, out = gated(following.flatten(-3, -2), hidden[seeds, steps])
+        cell = added + kept * torch.stack(cells, dim=1)[seeds, steps]
+        return self._logits(out * cell.tanh(), following, x.shape[-2])
+
+    def _embed(self, x: Tensor) -> Tensor:
+        """Embed the edges at every step: x (B, T, N, D) -> (T, B, N * (N - 1), H)."""
         edges = self.edges_in(x)  # (B, T, N, N, H), sender first
         nodes = self.nodes(torch.cat([mean_over_senders(edges), x], dim=-1))
         edges = torch.relu(self.edges_out(nodes) + edges)
-        sequences = off_diagonal(edges).transpose(-4, -3)  # (T, B, N * (N - 1), H)
-        embedded, memory = self.lstm(sequences.flatten(-3, -2), memory)
-        logits = self.head(embedded).unflatten(-2, sequences.shape[-3:-1])  # (T, B, N * (N - 1), K)
-        return on_diagonal(logits.transpose(-4, -3), n), memory
+        return off_diagonal(edges).transpose(-4, -3)
+
+    def _logits(self, remembered: Tensor, like: Tensor, agents: int) -> Tensor:
+        """Map the LSTM's outputs (T, B * N * (N - 1), H) to logits (B, T, N, N, K); `like` is what `_embed` returns."""
+        logits = self.head(remembered).unflatten(-2, like.shape[-3:-1])  # (T, B, N * (N - 1), K)
+        return on_diagonal(logits.transpose(-4, -3), agents)
 
 
 def remember(weights: Sequence[Tensor], sequences: Tensor, memory: Memory | None) -> tuple[Tensor, Memory]:
@@ -146,6 +178,11 @@ def few_way_softmax(x: Tensor) -> Tensor:
 
 
 def edge_entropy(logits: Tensor) -> Tensor:
-    """Return the entropies (...) of edge-type distributions with logits (..., K) in nats, between 0 and log K."""
+    """Return the mean entropy (...) of the edges' types in nats, between 0 and log K, given logits (..., N, N, K).
+
+    The diagonal is no edge; a single agent has none, and the entropy 0.
+    """
+    n = logits.shape[-2]
     log_p = torch.log_softmax(logits.movedim(-1, 0).contiguous(), dim=0)  # the last axis is slow for small K
-    return -(log_p.exp() * log_p).sum(dim=0)
+    entropies = -(log_p.exp() * log_p).sum(dim=0)
+    return (entropies * sender_weights(n, logits).squeeze(-1)).sum(dim=(-2, -1)) / n

@@ -15,7 +15,7 @@ from ssmail.config.sections import SacSpec
 from ssmail.losses import PER_SEED
 from ssmail.losses.soft_actor_critic import critic_loss, critic_target, soft_value, temperature_loss
 from ssmail.models.critic import TwinCritic
-from ssmail.models.graph_encoder import edge_entropy
+from ssmail.models.graph_encoder import edge_entropy, sample_graph
 from ssmail.models.policy import Actor, GraphPolicy
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import entries, fitted, load_part
@@ -23,6 +23,7 @@ from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import Generators, GeneratorsOfSeeds, drawn, normal_like
 from ssmail.training.stacking import Block, StackedAdam, fixed, stacked_modules
 
+REPLACED = 1e-4  # scaled units: a next state that differs more from the integrator's is an intervention, not rounding
 Reward = Callable[[Tensor, Tensor], Tensor]
 """Maps features (S, B, C, N, F) and actions as read (S, B, C, N, A) to rewards (S, B, C, N)."""
 
@@ -85,7 +86,7 @@ class Transitions:
     next_x: Tensor
     next_graph: Tensor  # detached
     next_velocity: Tensor
-    edge_entropy: Tensor  # (S,), nats, means over all steps
+    edge_entropy: Tensor  # (S,), nats, means over all edges and steps
     # for what comes after these steps
     steps: Tensor  # (S, C)
     histories: Tensor  # (S, B, T + 1, N, F) features of the whole trajectories
@@ -172,14 +173,23 @@ class SoftActorCritic:
         next_x = self.features(next_states, start, first_step=1)
         # One pass of the encoder over all T + 1 states gives the graphs at both ends of every transition.
         histories = torch.cat([x, next_x[..., -1:, :, :]], dim=-3)
-        graphs, entropy = self._graphs(histories)
+        noise = self._draw_graph_noise(histories)
+        graphs, entropy = self._graphs(histories, noise)
+        # An intervention put the expert's state in the place of the one that followed, which that graph has not read.
+        replaced = (batch.states[..., 1:, :, :] - next_states).abs().amax(dim=(-2, -1)) > REPLACED
+        replaced = at_steps(replaced, steps)
+        next_graph = at_steps(graphs.detach(), steps + 1)
+        if replaced.any():
+            logits = self.policy.encoder.logits_after(x, steps, at_steps(next_x, steps))
+            read = sample_graph(logits, at_steps(noise, steps + 1), self.policy.graph_temperature)
+            next_graph = torch.where(replaced[..., None, None, None], read.round(), next_graph)  # exactly one-hot
         return Transitions(
             x=at_steps(x, steps),
             actions=self.features.normalize_actions(at_steps(batch.actions, steps)),
             graph=at_steps(graphs, steps),
             states=at_steps(states, steps),
             next_x=at_steps(next_x, steps),
-            next_graph=at_steps(graphs.detach(), steps + 1),
+            next_graph=next_graph,
             next_velocity=at_steps(next_states, steps)[..., a:],
             edge_entropy=entropy,
             steps=steps,
@@ -187,20 +197,24 @@ class SoftActorCritic:
             graphs=graphs,
         )
 
-    def _graphs(self, history: Tensor) -> tuple[Tensor, Tensor]:
+    def _draw_graph_noise(self, history: Tensor) -> Tensor:
+        """Draw the noise of the graphs of features (S, B, T, N, F); it broadcasts to (S, B, T, N, N, K)."""
+        _, b, t, n, _ = history.shape
+        noise = drawn(self.generators["policy"], lambda g: self.policy.draw_graph_noise(b, t, n, g))
+        return noise.to(history.device).expand(-1, b, t, -1, -1, -1)
+
+    def _graphs(self, history: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """Sample graphs (S, B, T, N, N, K) from features (S, B, T, N, F); return them with their entropy (S,) in nats.
 
         Truncated backpropagation through time: with sac.encoder_steps, the gradient flows through a random window of
         that many consecutive steps only. The values do not depend on the window.
         """
-        _, b, t, n, _ = history.shape
-        noise = drawn(self.generators["policy"], lambda g: self.policy.draw_graph_noise(b, t, n, g))
-        noise = noise.to(history.device).expand(-1, b, t, -1, -1, -1)
+        t = history.shape[2]
         learned = min(self.spec.encoder_steps or t, t)
         if learned < t:
             return self._graphs_of_windows(history, noise, learned)
         graphs, logits, _ = self.policy.graphs(history, noise)
-        return graphs, edge_entropy(logits).mean(dim=(1, 2, 3, 4))
+        return graphs, edge_entropy(logits).mean(dim=(1, 2))
 
     def _graphs_of_windows(self, history: Tensor, noise: Tensor, learned: int) -> tuple[Tensor, Tensor]:
         """Read the steps before, in and after a window of `learned` steps in turn; only the window has a gradient.
@@ -219,7 +233,7 @@ class SoftActorCritic:
                     )
                 graphs.append(graph)
                 logits.append(logit)
-        return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2, 3, 4))
+        return torch.cat(graphs, dim=2), edge_entropy(torch.cat(logits, dim=2)).mean(dim=(1, 2))
 
     def _sample(self, actor: Actor, x: Tensor, graph: Tensor, velocity: Tensor) -> tuple[Tensor, Tensor]:
         """Sample actions, in scaled units, with their log-probabilities."""
