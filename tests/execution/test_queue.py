@@ -16,7 +16,8 @@ from ssmail.execution.local import run_waiting
 from ssmail.execution.sources import QueueSource
 from ssmail.store import RunState, Store
 from ssmail.store.connection import reading, writing
-from ssmail.store.queue import Enqueued, longest_waiting
+from ssmail.store.queries import longest_waiting
+from ssmail.store.queue import Enqueued
 from tests.execution.fake_loop import Crashes, Patient, Unsteady, Walk
 from tests.execution.fake_worker import fake_worker
 from tests.execution.one_cell import run_cell
