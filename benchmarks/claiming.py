@@ -6,7 +6,6 @@ were taken. Claims are those of a worker, of one cell or of eight seeds, in one 
 """
 
 import argparse
-import os
 import statistics
 import subprocess
 import sys
@@ -18,13 +17,20 @@ from pathlib import Path
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
 from ssmail.store import Store
-from ssmail_cli.options import database_words
 
 SIZES = (1_000, 10_000, 100_000)
 SPECS = (100, 1)
 TOGETHER = (1, 8)
 CLAIMS = 50  # that are timed
 COLUMNS = ("database", "specs", "waiting", "add_ms", "claim_ms", "slowest_ms", "claim_8_ms", "slowest_8_ms")
+LIST = """
+import sys
+from ssmail.store.run_metadata import peak_memory_bytes
+from ssmail_cli.main import run
+code = run(["queue", "--db", sys.argv[1]])
+print(peak_memory_bytes() / 2**20, file=sys.stderr)
+sys.exit(code)
+"""
 SHOWN = (*COLUMNS, "queue_s", "queue_mb")
 
 
@@ -63,12 +69,9 @@ def claim(store: Store, most: int) -> None:
 
 def listed(where: str) -> tuple[float, float]:
     """Return the seconds and the peak memory in MB of `ssmail queue` in a new process."""
-    command = [sys.executable, "-m", "ssmail_cli", "queue", *database_words(where)]
     began = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    _, code, used = os.wait4(process.pid, 0)
-    assert code == 0
-    return time.perf_counter() - began, used.ru_maxrss / 1024
+    done = subprocess.run([sys.executable, "-c", LIST, where], capture_output=True, text=True, check=True)
+    return time.perf_counter() - began, float(done.stderr.splitlines()[-1])
 
 
 def seconds(work: Callable[[], object]) -> float:

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, select
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, literal_column, select
 
 from ssmail.config.changes import changes, with_changes
 from ssmail.config.spec import with_added_keys
@@ -135,7 +135,9 @@ def runs(
     for_update: on a server, nobody else changes the rows until the transaction ends; in SQLite it is so anyway.
     skip_locked: the same, without rows that somebody else is about to change. limit: read so many rows, the oldest.
     """
-    query = select(*raw(schema.run)).where(*conditions).order_by(schema.run.c.started, schema.run.c.id).limit(limit)
+    query = select(*raw(schema.run)).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
+    if limit is not None:
+        query = query.limit(_number(limit))
     if for_update or skip_locked:
         query = query.with_for_update(skip_locked=skip_locked)
     return [RunRow(**values) for values in sound_rows(connection, schema.run, query, damaged)]
@@ -228,7 +230,7 @@ def _counts(row: RunRow) -> bool:
 def longest_waiting(without: set[str]) -> Select[Any]:
     """Return the query for the id of the run that has waited longest, but those; it reads one entry of the index."""
     query = select(schema.run.c.id).where(schema.run.c.state == RunState.QUEUED, *_not_among(without))
-    return query.order_by(schema.run.c.started, schema.run.c.id).limit(1).with_for_update(skip_locked=True)
+    return query.order_by(schema.run.c.started, schema.run.c.id).limit(_number(1)).with_for_update(skip_locked=True)
 
 
 def _not_among(without: set[str]) -> list[ColumnElement[bool]]:
@@ -241,7 +243,7 @@ def count_waiting(connection: Connection, spec_hash: str) -> int:
     waiting = (
         select(schema.run.c.id)
         .where(schema.run.c.spec_hash == spec_hash, schema.run.c.state == RunState.QUEUED)
-        .limit(MOST_COUNTED)
+        .limit(_number(MOST_COUNTED))
     )
     return int(connection.execute(select(func.count()).select_from(waiting.subquery())).scalar_one())
 
@@ -256,6 +258,11 @@ def others_waiting(connection: Connection, first: RunRow, count: int, without: s
         schema.run.c.id != first.id,
     )
     return runs(connection, *same, *_not_among(without), limit=count, skip_locked=True)
+
+
+def _number(value: int) -> ColumnElement[int]:
+    """Return a number that is part of the statement: a server that plans for any limit would sort all that waits."""
+    return literal_column(str(int(value)))
 
 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:
