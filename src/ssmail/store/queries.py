@@ -214,7 +214,9 @@ def newest_of_cells(
     connection: Connection, spec_hash: str, seeds: Sequence[int], *, for_update: bool = False
 ) -> dict[int, RunRow]:
     """Return the newest run (see newest_of_cell) of those of the seeds that have one; MOST_AT_ONCE seeds at most."""
-    cells = (schema.run.c.spec_hash == spec_hash, schema.run.c.seed.in_(seeds))
+    seed = schema.run.c.seed
+    # With the bounds, a server that expects few runs of the spec does not read all of them instead.
+    cells = (schema.run.c.spec_hash == spec_hash, seed.in_(seeds), seed >= min(seeds), seed <= max(seeds))
     newest: dict[int, RunRow] = {}
     for row in runs(connection, *cells, for_update=for_update):
         if _counts(row) or row.seed not in newest or not _counts(newest[row.seed]):

@@ -23,7 +23,7 @@ QUEUE = "queue"
 _NOBODY = QUEUE.ljust(32, "-")
 _INDEXES = (
     "CREATE INDEX IF NOT EXISTS run_waiting ON run (state, started, id)",
-    "CREATE INDEX IF NOT EXISTS run_waiting_of_spec ON run (spec_hash, state, started, id)",
+    "CREATE INDEX IF NOT EXISTS run_waiting_of_spec ON run (state, spec_hash, started, id)",
 )
 """Made with the first queue: a database of an earlier ssmail needs no upgrade, and an earlier ssmail still opens it."""
 
@@ -235,12 +235,11 @@ class Contents(NamedTuple):
 
 def _take_waiting(connection: Connection, rows: Sequence[RunRow], now: datetime) -> list[Claim]:
     """Claim those of the waiting runs of a spec whose cells have no newer run, after a merge or --resume never."""
-    newest = queries.newest_of_cells(connection, rows[0].spec_hash, [row.seed for row in rows])
     claims = []
     for row in rows:
-        found = newest.get(row.seed, row)
-        if found.id != row.id:
-            _leave_to(connection, row, found)
+        newest = queries.newest_of_cell(connection, row.spec_hash, row.seed)
+        if newest is not None and newest.id != row.id:
+            _leave_to(connection, row, newest)
         elif isinstance(taken := _take(connection, row, now), Claim):
             claims.append(taken)
     return claims
