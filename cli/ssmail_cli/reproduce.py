@@ -76,7 +76,8 @@ def reproduce(
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
 
     Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: after Ctrl-C or a kill,
-    the same command continues. With --enqueue, workers train them, and the same command without it draws. A run that fails stops neither the others nor the figures. report.md and report.html go
+    the same command continues. With --enqueue it ends before the training; once workers have done that, the same
+    command without it draws. A run that fails stops neither the others nor the figures. report.md and report.html go
     beside the folder of the figures; where figures are named there is no report, and `ssmail report` writes one of all
     that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
     paths of the files. Exit code 3: some runs did not finish, or figures were left out.

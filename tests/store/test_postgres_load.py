@@ -33,12 +33,14 @@ def environment(**others: str) -> dict[str, str]:
     return {**kept, "PYTHONPATH": os.pathsep.join(sys.path), "OMP_NUM_THREADS": "1", **others}
 
 
-def start_workers(folder: Path, url: str, settings: dict[str, str], count: int) -> "list[subprocess.Popen[bytes]]":
-    """Start workers that end when nothing waits; each has a log of its own, worker 0.log and so on."""
+def start_workers(
+    folder: Path, url: str, settings: dict[str, str], count: int, idle: int = 0
+) -> "list[subprocess.Popen[bytes]]":
+    """Start workers that end when nothing waits for a time; each has a log of its own, worker 0.log and so on."""
     started = []
     for number in range(count):
         with (folder / f"worker {number}.log").open("wb") as log:
-            words = [*SSMAIL, "worker", "--idle-exit", "0", "--device", "cpu", "--db", url]
+            words = [*SSMAIL, "worker", "--idle-exit", str(idle), "--device", "cpu", "--db", url]
             started.append(subprocess.Popen(words, cwd=folder, env=settings, stdout=log, stderr=log))
     return started
 
@@ -156,7 +158,7 @@ def test_the_cells_of_a_killed_worker_are_computed_by_the_others(
     settings, words = environment(SSMAIL_STALE_SECONDS="20"), TRAIN.split()
     subprocess.run([*SSMAIL, *words, "--db", "calm.db"], env=settings, check=True, capture_output=True)
     subprocess.run([*SSMAIL, *words, "--enqueue", "--db", url], env=settings, check=True, capture_output=True)
-    workers = start_workers(tmp_path, url, settings, 3)
+    workers = start_workers(tmp_path, url, settings, 3, idle=40)  # longer than a dead one is waited for
     store = Store.open(url)
     while store.metrics([row.id for row in store.runs(state="running")], ["seconds"]).empty:
         assert None in [worker.poll() for worker in workers]
@@ -169,9 +171,6 @@ def test_the_cells_of_a_killed_worker_are_computed_by_the_others(
     codes = [worker.wait() for worker in workers]
     assert codes.pop(victim) == -signal.SIGKILL
     assert codes == [0, 0], [path.read_text() for path in tmp_path.glob("worker*.log")]
-    subprocess.run(
-        [*SSMAIL, "worker", "--idle-exit", "30", "--db", url], env=settings, check=True
-    )  # if it was the last
     calm, runs = Store.open("calm.db"), store.runs()
     assert Counter((row.state, row.resumes > 0) for row in runs)[RunState.FINISHED, True] > 0  # the kill hit something
     assert {row.state for row in runs} == {RunState.FINISHED}
