@@ -288,7 +288,10 @@ def test_a_held_lock_is_one_sentence(server: Server, database: str, monkeypatch:
 
 def test_other_drivers_and_forms_of_a_url() -> None:
     assert as_url("postgresql://me@h/d").drivername == "postgresql+psycopg"
-    assert as_url("postgresql+pg8000://me@h/d").drivername == "postgresql+pg8000"
+    assert as_url("postgres://me@h/d").drivername == "postgresql+psycopg"
+    for driver in ("psycopg2", "pg8000"):
+        with pytest.raises(InputError, match=rf"{driver} is no driver that ssmail uses; write postgresql://"):
+            as_url(f"postgresql+{driver}://me@h/d")
     assert describe(make_engine(as_url("postgresql://me:pw@h/d"))) == "postgresql://me:***@h/d"
     found = server.arguments(make_url("postgresql+psycopg://h/d?connect_timeout=3&options=-cx%3D1"), 120)
     assert not found.keys() & {"connect_timeout", "options"}
