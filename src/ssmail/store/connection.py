@@ -167,7 +167,7 @@ def as_url(where: str | Path) -> URL:
         raise InputError(f"{shown} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from None
     if url.drivername.startswith("postgresql+") and url.drivername not in DRIVERS:
         raise InputError(
-            f"{shortened(url.drivername, 60)} is no driver that ssmail uses; write postgresql://, which is for psycopg 3"
+            f"{shortened(url.drivername, 60)} is no driver that ssmail uses; write postgresql://, for psycopg 3"
         )
     if url.drivername not in DRIVERS:  # SQLAlchemy would import whatever package calls itself so
         raise InputError(
