@@ -91,5 +91,5 @@ def test_a_few_desktops_with_postgresql(own_server: Server, tmp_path: Path, monk
     listed = subprocess.run(["pg_restore", "--list", dump], capture_output=True, text=True, check=True).stdout
     assert "TABLE DATA public run " in listed
     with own_server.connect() as admin:
-        rules = admin.execute("SELECT error FROM pg_hba_file_rules WHERE user_name = '{lab}'").fetchall()
-    assert rules == [(None,)]
+        rules = admin.execute("SELECT auth_method, address FROM pg_hba_file_rules WHERE user_name = '{lab}'").fetchall()
+    assert rules == [("scram-sha-256", "192.168.1.0")]
