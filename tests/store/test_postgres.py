@@ -224,6 +224,24 @@ def test_a_commit_whose_answer_is_lost_counts_once(step: str, remote: Store, mon
         writer.epoch(2, {"a": 1.0})
 
 
+def test_a_claimed_run_is_resumed_once_though_the_answer_is_lost(
+    remote: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = start(remote)
+    writer.epoch(1, {"a": 1.0})
+    writer.finish(RunState.INTERRUPTED)
+    (claim,) = remote.queue.claim([(SPEC, 0)], lambda _: True)
+    assert isinstance(claim, Claim)
+    commits = lost_answer(remote, monkeypatch)
+    remote.resume_run(claim.run_id, 1, claim)
+    assert (commits(), remote.runs()[0].resumes) == (2, 1)
+    (new,) = remote.queue.claim([(SPEC, 1)], lambda _: True)
+    assert isinstance(new, Claim)
+    commits = lost_answer(remote, monkeypatch)
+    remote.resume_run(new.run_id, 0, new, dataset_hash="d" * 64)
+    assert (commits(), remote.runs()[-1].resumes) == (2, 0)
+
+
 def test_an_epoch_that_is_not_recognized_would_be_refused(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control, for the epoch above; and an epoch that was there before is refused as in SQLite."""
     writer = start(remote)

@@ -193,7 +193,7 @@ class Store:
         `from_step`.
         """
         owner = claim.owner if claim else uuid.uuid4().hex
-        claimed = self.run(run_id) if claim else None
+        met: list[RunRow] = []  # the row by attempt; the first may have been committed, if only the answer was lost
 
         def resume(connection: Connection, again: bool) -> RunRow:
             row = queries.one_run(connection, run_id, for_update=True)
@@ -204,7 +204,8 @@ class Store:
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
-            before = claimed or row  # as it was before an attempt of which the answer was lost
+            met.append(row)
+            before = met[0] if claim else row
             changes = {
                 "state": RunState.RUNNING,
                 "error": None,
