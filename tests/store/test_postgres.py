@@ -15,7 +15,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunState, RunWriter, Store, connection, server
 from ssmail.store.connection import as_url, describe, make_engine, write
-from ssmail.store.queue import Claim
+from ssmail.store.queue import Claim, interrupt
 from tests.store.databases import SPEC, add
 from tests.store.postgres_server import PASSWORD, Server
 
@@ -353,3 +353,23 @@ def test_runs_that_wait_are_claimed_once_and_those_of_a_silent_worker_again(remo
     impatient = Store.open(url, stale_seconds=1e-6)
     assert len(impatient.queue.claim_waiting(lambda row, waiting: 24, set())) == 24
     impatient.close()
+
+
+def test_what_another_process_is_taking_over_is_left_to_it(server: Server, database: str, remote: Store) -> None:
+    """Two workers find the same silent run; the second one must not take it from the first."""
+    remote.queue.add([(SPEC, 0)])
+    (claim,) = remote.queue.claim_waiting(lambda *_: 1, set())
+    with server.connect(database) as admin:
+        admin.execute("UPDATE run SET heartbeat = '2026-01-01'")
+    (silent,) = remote.runs()
+    taken = "UPDATE run SET owner = 'queue-of-the-first', heartbeat = clock_timestamp() AT TIME ZONE 'utc'"
+    with server.connect(database) as admin, admin.transaction():
+        admin.execute(taken)
+        assert remote.queue.claim_waiting(lambda *_: 1, set()) == []
+    write(remote._engine, lambda connection, _: interrupt(connection, silent))  # as it was met before
+    assert remote.queue.claim_waiting(lambda *_: 1, set()) == []
+    (row,) = remote.runs()
+    assert (row.owner, str(row.state)) == ("queue-of-the-first", "running")
+    with server.connect(database) as admin:  # negative control
+        admin.execute("UPDATE run SET heartbeat = '2026-01-01'")
+    assert [found.run_id for found in remote.queue.claim_waiting(lambda *_: 1, set())] == [claim.run_id]

@@ -192,11 +192,16 @@ def clock(connection: Connection) -> datetime:
 
 
 def silent_runs(
-    connection: Connection, stale_seconds: float = STALE_SECONDS, *, for_update: bool = False
+    connection: Connection,
+    stale_seconds: float = STALE_SECONDS,
+    *,
+    for_update: bool = False,
+    skip_locked: bool = False,
 ) -> list[RunRow]:
     """Return the RUNNING runs that are not alive (see RunRow.is_alive)."""
     silent = is_silent(clock(connection), stale_seconds)
-    return runs(connection, schema.run.c.state == RunState.RUNNING, silent, for_update=for_update)
+    running = schema.run.c.state == RunState.RUNNING
+    return runs(connection, running, silent, for_update=for_update, skip_locked=skip_locked)
 
 
 def is_silent(now: datetime, stale_seconds: float) -> ColumnElement[bool]:

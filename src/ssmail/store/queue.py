@@ -151,7 +151,7 @@ class Queue:
 
         def claim(connection: Connection, _again: bool) -> list[Claim]:
             now = queries.clock(connection)
-            for row in queries.silent_runs(connection, self._stale_seconds):
+            for row in queries.silent_runs(connection, self._stale_seconds, skip_locked=True):
                 if row.owner.startswith(QUEUE):
                     interrupt(connection, row)
             while (run_id := connection.execute(queries.longest_waiting(without)).scalar()) is not None:
@@ -283,7 +283,7 @@ def interrupt(connection: Connection, row: RunRow) -> None:
     error = (
         f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
     )
-    end(connection, row.id, RunState.INTERRUPTED, error)
+    end(connection, row.id, RunState.INTERRUPTED, error, row.owner)  # unless another process took it meanwhile
 
 
 def end(connection: Connection, run_id: str, state: RunState, error: str, owner: str | None = None) -> None:
