@@ -1,6 +1,6 @@
 """Time of putting cells into the queue, of claiming one, and of `ssmail queue`, against the number that waits.
 
-`python benchmarks/claiming.py --db URL` measures an SQLite file and an empty database on a server, in turns. The cells
+`python benchmarks/claiming.py --db URL --db URL` measures SQLite files and two empty databases on a server. The cells
 have either 100 specs or one. Each size is measured in the same database after the one before, from which only claims
 were taken. Claims are those of a worker, of one cell or of eight seeds, in one transaction each.
 """
@@ -86,6 +86,15 @@ def shown(value: float | str) -> str:
     return f"{value:.2f}" if isinstance(value, float) else str(value)
 
 
+def report(urls: Sequence[str] = (), sizes: Sequence[int] = SIZES) -> None:
+    """Measure an SQLite file, and beside it one of the empty databases on a server, for each of SPECS."""
+    print("  ".join(f"{column:>12}" for column in SHOWN), flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for place, count in enumerate(SPECS):
+            for where in [str(Path(folder) / f"{count}.db"), *urls[place : place + 1]]:
+                measure(where, count, sizes)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
@@ -93,9 +102,4 @@ if __name__ == "__main__":
     )
     parser.add_argument("--sizes", type=int, nargs="+", default=SIZES)
     arguments = parser.parse_args()
-    print("  ".join(f"{column:>12}" for column in SHOWN))
-    with tempfile.TemporaryDirectory() as folder:
-        for place, count in enumerate(SPECS):
-            files = [str(Path(folder) / f"{count}.db")]
-            for database in files + arguments.db[place : place + 1]:
-                measure(database, count, arguments.sizes)
+    report(arguments.db, arguments.sizes)
