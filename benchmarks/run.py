@@ -1,5 +1,5 @@
-"""`make bench`: time the command line, an epoch of training, the store, its queue, the training steps of nri and dnri, and
-how training grows with the number of agents.
+"""`make bench`: time the command line, an epoch of training, the store, its queue, the training steps of nri and dnri,
+and how training grows with the number of agents.
 
 Training uses one thread.
 """
