@@ -1,5 +1,5 @@
-"""`make bench`: time the command line, an epoch of training, the store, the training steps of nri and dnri, and how
-training grows with the number of agents.
+"""`make bench`: time the command line, an epoch of training, the store, its queue, the training steps of nri and dnri,
+and how training grows with the number of agents.
 
 Training uses one thread.
 """
@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import claiming
 import cost_by_agents
 import torch
 from message_passing import compare
@@ -86,6 +87,7 @@ if __name__ == "__main__":
         ("stored epoch", stored_epoch),
     ):
         print(f"{name:<16}{measure():9.4f} s", flush=True)
+    claiming.report()
     compare()
     report(["authors", "quick"])
     cost_by_agents.report(Path("build"))

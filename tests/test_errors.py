@@ -3,6 +3,7 @@
 import shlex
 import subprocess
 from pathlib import Path
+from urllib.parse import quote
 
 import pytest
 from hypothesis import given
@@ -21,7 +22,12 @@ SECRETS = [
     "postgresql://u:SECRET@h/d?password=SECRET",
     "nonsense://u:SECRET@",
     "postgresql://u:SEC@RET/%40h/d",
+    "postgresql://h/d?PassWord=SECRET",
+    "postgresql://h/d?sslkey=SECRET&sslpassword=SECRET&host=x",
+    "postgresql://h/d?host=x&api_token=SECRET&client+secret=SECRET",
 ]
+KEYS = ["password", "PASSWORD", "sslpassword", "sslkey", "p%61ssword", "Secret", "access_token", "pwd", "passphrase"]
+SHOWN_KEYS = ["host", "user", "sslmode", "passfile", "application_name", "options", "keepalives_idle"]
 
 
 @pytest.mark.parametrize(
@@ -60,7 +66,52 @@ def test_no_password_of_a_url_is_shown(url: str) -> None:
     assert masked(masked(url)) == masked(url)
 
 
-@pytest.mark.parametrize("url", ["postgresql://u@h:5432/d", "sqlite:////tmp/a.db", "results/a:b@c.db", "C:/a b.db"])
+@given(
+    st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\n"), min_size=1),
+    st.sampled_from(KEYS),
+    st.sampled_from(SHOWN_KEYS),
+    st.text("abcXYZ0123_-/+", max_size=8),
+    st.sampled_from(["", "; check it", " computes them", "'", "`", ")."]),
+)
+def test_passwords_are_masked_and_nothing_else(secret: str, key: str, other: str, value: str, rest: str) -> None:
+    """Before the host and in the query, as a URL is written: whatever the password, and with it whatever follows."""
+    quoted = quote(f"<{secret}>")  # which is nowhere else
+    before, after = (
+        f"postgresql://u:{quoted}@h:1/d?{other}={value}",
+        f"postgresql://u@h/d?{key}={quoted}&{other}={value}",
+    )
+    for url in (before, after, f"postgresql://u@h/d?{other}={value}&{key}={quoted}"):
+        for text in (url, f"see {url}{rest}", f"see `x --db '{url}'{rest}"):
+            shown = masked(text)
+            assert shown == text.replace(quoted, "***")
+            assert masked(shown) == shown
+
+
+@given(
+    st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\n&"), min_size=1), st.sampled_from(KEYS)
+)
+def test_a_password_that_is_not_encoded_is_masked_too(secret: str, key: str) -> None:
+    for url in (f"postgresql://u:<{secret}>@h/d", f"postgresql://h/d?{key}=<{secret}>"):
+        assert "<" not in masked(url)
+        assert ">" not in masked(url)
+
+
+@given(st.text(st.characters(blacklist_categories=["Cs"])))
+def test_masking_twice_is_masking_once(text: str) -> None:
+    for given_text in (text, f"a://{text}", f"a://b:{text}@c?password={text}"):
+        assert masked(masked(given_text)) == masked(given_text)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql://u@h:5432/d?host=/tmp&passfile=/home/u/.pgpass",
+        "postgresql://u@h:5432/d",
+        "sqlite:////tmp/a.db",
+        "results/a:b@c.db",
+        "C:/a b.db",
+    ],
+)
 def test_a_name_without_a_password_stays(url: str) -> None:
     assert masked(url) == url
 

@@ -18,7 +18,7 @@ from ssmail_cli.options import is_missing, noting_damage, parse_seeds
 from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
 from ssmail_cli.report import draw_or_report, not_drawn, write_report
-from ssmail_cli.sweep import Rows, compute, finish, is_interrupted, plan, result_rows, unfinished
+from ssmail_cli.sweep import Rows, compute, enqueue, finish, is_interrupted, plan, result_rows, unfinished
 
 if TYPE_CHECKING:
     from ssmail.config.spec import RunSpec
@@ -65,6 +65,7 @@ def reproduce(
     jobs: options.Jobs = 2,
     device: options.DeviceOption = options.AUTO,
     cmu: CmuDir = None,
+    enqueue_only: options.Enqueue = False,
     dry_run: DryRun = False,
     as_json: options.Json = False,
     out: options.OutDir = options.DEFAULT_OUT,
@@ -75,7 +76,8 @@ def reproduce(
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
 
     Runs that figures share are trained once, stored ones are skipped, interrupted ones resumed: after Ctrl-C or a kill,
-    the same command continues. A run that fails stops neither the others nor the figures. report.md and report.html go
+    the same command continues. With --enqueue it ends before the training; once workers have done that, the same
+    command without it draws. A run that fails stops neither the others nor the figures. report.md and report.html go
     beside the folder of the figures; where figures are named there is no report, and `ssmail report` writes one of all
     that is stored. fig7 and fig8 need recorded walking (`ssmail prep-mocap`), and are left out without it. Prints the
     paths of the files. Exit code 3: some runs did not finish, or figures were left out.
@@ -92,6 +94,9 @@ def reproduce(
     data.tell()
     if dry_run:
         _print_plan(figures, data, db, jobs, as_json)
+        return
+    if enqueue_only:
+        enqueue(_prepare(figures, data, cmu, db), db, Resume.AUTO, as_json)
         return
     store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device))
     runs = _settled_runs(store, figures, data, sweep, rows)
@@ -194,16 +199,13 @@ def _trainable(figures: Mapping[str, Sweep], data: _Data) -> Sweep:
     return _merged(cells for name, cells in figures.items() if name not in data.missing)
 
 
-def _train(
-    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
-) -> "tuple[Store, Sweep, Rows]":
-    """Make the data and compute every cell, the longest first.
+def _prepare(figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str) -> Sweep:
+    """Make the data and return every cell, the longest first.
 
     The data has the defaults of `ssmail prep-mocap`. Raises InputError when a file of the CMU database is missing or
-    damaged, and typer.Exit when interrupted.
+    damaged.
     """
     from ssmail.execution.planning import check_labels, longest_first
-    from ssmail.store import Store
 
     needed = _trainable(figures, data)
     sweep = {cell: needed[cell] for cell in longest_first(list(needed), _seconds(needed, db))}
@@ -211,6 +213,16 @@ def _train(
     for path in sorted({path for name in data.made for path, _ in _absent_files(figures[name])}):
         with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
             prep_mocap(source=cmu, out=Path(path))
+    return sweep
+
+
+def _train(
+    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
+) -> "tuple[Store, Sweep, Rows]":
+    """Make the data and compute every cell, as _prepare has them. Raises typer.Exit when interrupted, too."""
+    from ssmail.store import Store
+
+    sweep = _prepare(figures, data, cmu, db)
     store = noting_damage(Store.open(db))
     rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
     if is_interrupted(rows):

@@ -95,18 +95,23 @@ def worker(
 
 
 def queue(
-    as_json: options.Json = False, form: options.Output = None, db: options.Database = options.DEFAULT_DATABASE
+    limit: Annotated[int, typer.Option("--limit", min=1, help="Show so many runs at most.")] = 50,
+    as_json: options.Json = False,
+    form: options.Output = None,
+    db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
-    """Show the runs that wait, are being computed, or whose process has died.
+    """Show how many runs wait, are being computed, or have a process that died, and the first of them.
 
     Those that have died are taken over by the next process with the same sweep, or by a worker if they were in the
     queue.
     """
     store = open_store(db, MADE_BY, mark_dead=False)  # what is dead is shown, or taken over, as such
-    runs, now = store.queue.rows()
-    rows = [_row(store, run, now) for run in runs]
-    count = {name: sum(row["cell"] == name for row in rows) for name in ("waiting", "running", "dead")}
-    note(f"{counted(len(rows), 'run')}: {', '.join(f'{number} {name}' for name, number in count.items())}")
+    found = store.queue.contents(limit)
+    rows = [_row(store, run, found.now) for run in found.rows]
+    total = found.waiting + found.running + found.dead
+    more = f"; only the first {len(rows)} of them here (--limit)" if len(rows) < total else ""
+    counts = f"{found.waiting} waiting, {found.running} running, {found.dead} dead"
+    note(f"{counted(total, 'run')}: {counts}{more}")
     for row in rows:
         row["since"] = duration(max(0.0, row["seconds"]))
     print_rows(rows, COLUMNS, chosen_format(as_json, form))

@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
+from urllib.parse import unquote_plus
 
 LONGEST = 300
 """Characters of a message."""
@@ -22,7 +23,12 @@ _INVISIBLE = re.compile(
 )
 _CREDENTIALS = re.compile(r"(://[^\s:/?#@]*):.*(@|%40)")
 _LONG_COMMAND = re.compile(r"`[^`]{60,}`")
-_QUERY = re.compile(r"(?<=://)([^\s?]*\?)(\S*)")
+# A key of a query and its value. The end of a URL within a text is a space, a quote, or punctuation
+# before one of them. A text that begins with a URL is all of it: a value may have spaces, unless it was masked before.
+_END = r"""(?=[;,.:)]*(?:[\s&'"`]|$))"""
+_IN_TEXT = re.compile(rf"""(?<=[?&])([^\s=&?'"`]+)=[^\s&'"`]*?{_END}""")
+_IN_URL = re.compile(rf"(?<=[?&])([^\s=&?]+)=(?!\*\*\*{_END})[^&\n]*")
+_SECRET = re.compile("pass(?!file$)|pwd|pw$|secret|token|key|credential", re.IGNORECASE)
 
 
 class ExitCode(IntEnum):
@@ -86,11 +92,12 @@ def _shown(character: str) -> str:
 
 
 def masked(text: str) -> str:
-    """Return the text with *** for the password of a URL in it, and for the values in the URL's query."""
+    """Return the text with *** for the passwords of URLs in it: before the host, and as values of keys in a query."""
     if "://" not in text:
         return text
     hidden = _CREDENTIALS.sub(r"\1:***@", text)
-    return _QUERY.sub(lambda found: found[1] + re.sub(r"=[^&]*", "=***", found[2]), hidden)
+    pairs = _IN_URL if re.match(r"[\w+.-]+://", hidden) else _IN_TEXT
+    return pairs.sub(lambda pair: f"{pair[1]}=***" if _SECRET.search(unquote_plus(pair[1])) else pair[0], hidden)
 
 
 def shortened(text: str, length: int) -> str:

@@ -27,7 +27,7 @@ DRAW = random.Random(6)
 NAMES = ("disturbed", "calm")
 
 
-def figures(folder: Path, db: Path) -> Mapping[str, str]:
+def figures(folder: Path, db: Path | str) -> Mapping[str, str]:
     """The CSV of each figure, with the spec and seed of each run in place of its id."""
     runs = {run.id: f"{run.spec_hash} {run.seed}" for run in Store.open(db).runs()}
     tables = {path.name: path.read_text() for path in folder.glob("*.csv")}

@@ -41,9 +41,12 @@ def test_the_queue_tells_the_living_from_the_dead(cli: CommandLine, db: Path, mo
     cli(*COPY, "--enqueue", "--db", db)
     store = Store.open(db)
     store.queue.claim_waiting(lambda *_: 1, set())
-    assert [row["cell"] for row in cli("queue", "--db", db).rows] == ["waiting", "running"]
+    assert [row["cell"] for row in cli("queue", "--db", db).rows] == ["running", "waiting"]
     monkeypatch.setenv("SSMAIL_STALE_SECONDS", "0.000001")
-    assert [row["cell"] for row in cli("queue", "--db", db).rows] == ["waiting", "dead"]
+    assert [row["cell"] for row in cli("queue", "--db", db).rows] == ["dead", "waiting"]
+    short = cli("queue", "--limit", 1, "--db", db)
+    assert [row["cell"] for row in short.rows] == ["dead"]
+    assert "2 runs: 1 waiting, 0 running, 1 dead; only the first 1 of them here (--limit)" in short.err
     assert {str(row.state) for row in store.runs()} == {"queued", "running"}  # looking changes nothing
 
 

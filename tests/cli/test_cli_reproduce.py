@@ -57,6 +57,18 @@ def test_shared_cells_are_planned_once(cli: CommandLine, db: Path) -> None:
     assert not db.parent.exists()
 
 
+def test_enqueued_runs_are_those_of_the_figures_and_nothing_is_drawn(
+    cli: CommandLine, db: Path, tmp_path: Path, fake: FakeTraining
+) -> None:
+    words = ("fig4", "fig9", "--out", tmp_path / "figures", "--db", db)
+    put = cli(*SMOKE, "--enqueue", *words)
+    assert put.code == 0, put.err
+    assert [row["action"] for row in put.rows] == ["queued"] * 6
+    assert [row["action"] for row in cli(*SMOKE, "--enqueue", *words).rows] == ["waiting"] * 6
+    assert "6 runs: 6 waiting" in cli("queue", "--db", db).err
+    assert not (tmp_path / "figures").exists()
+
+
 def test_without_only_every_figure_is_planned(cli: CommandLine, db: Path) -> None:
     figures = plan(cli(*SMOKE, "--dry-run", "--db", db))
     listed = dict.fromkeys(module.name for module in FIGURES.values())

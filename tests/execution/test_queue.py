@@ -14,9 +14,11 @@ from ssmail.config.experiments import build_spec
 from ssmail.execution.cells import Cell, Event, RunSettings
 from ssmail.execution.local import run_waiting
 from ssmail.execution.sources import QueueSource
-from ssmail.store import RunState, Store
+from ssmail.store import RunState, Store, queries
 from ssmail.store.connection import reading, writing
-from ssmail.store.queue import Enqueued, longest_waiting
+from ssmail.store.queries import longest_waiting
+from ssmail.store.queue import Enqueued
+from ssmail.store.validation import sound
 from tests.execution.fake_loop import Crashes, Patient, Unsteady, Walk
 from tests.execution.fake_worker import fake_worker
 from tests.execution.one_cell import run_cell
@@ -154,7 +156,74 @@ def test_a_claim_reads_one_entry_of_an_index_however_many_wait(store: Store, cel
     with writing(store._engine) as connection:
         connection.execute(text("DROP INDEX run_waiting"))
     store.close()  # and what it has prepared
-    assert "SCAN" in plan(store, set())  # negative control
+    assert "USE TEMP B-TREE FOR ORDER BY" in plan(store, set())  # negative control: all that wait are sorted
+
+
+def rows_read(monkeypatch: pytest.MonkeyPatch, work: Any) -> int:
+    """How many rows are read and checked while `work` is done."""
+    read: list[object] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(queries, "sound", lambda table, row: read.append(row) or sound(table, row))
+        work()
+    return len(read)
+
+
+def test_neither_a_claim_nor_the_end_of_a_run_reads_all_that_wait(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = build_spec("bc", "yjunction", "smoke", [])
+    store.queue.add([(spec, seed) for seed in range(300)])
+    for most in (1, 8):
+        assert rows_read(monkeypatch, lambda most=most: store.queue.claim_waiting(lambda *_: most, set())) == 2 * most
+    one = store.runs()[0].id
+    assert rows_read(monkeypatch, lambda: store.still_stored([one])) == 1
+    assert rows_read(monkeypatch, lambda: store.queue.contents(limit=5)) == 5
+    assert rows_read(monkeypatch, store.queue.contents) == 300  # negative control
+
+
+def test_many_cells_are_added_in_parts_and_taken_in_their_order(
+    store: Store, cells: list[Cell], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queries, "MOST_AT_ONCE", 2)
+    other = build_spec("copy-last", "yjunction", "smoke", [])
+    store.start_run(cells[1].spec, 1, dataset_hash=None, device="cpu")
+    store.start_run(other, 0, dataset_hash=None, device="cpu").finish(RunState.FINISHED)
+    pairs = [(cell.spec, cell.seed) for cell in cells]
+    mixed = [pairs[3], (other, 1), pairs[0], (other, 0), pairs[1], pairs[3], pairs[2]]
+    waits, runs, ended, anew = Enqueued.WAITING, Enqueued.RUNNING, Enqueued.STORED, Enqueued.QUEUED
+    assert store.queue.add(mixed) == [anew, anew, anew, ended, runs, waits, anew]
+    assert store.queue.add(mixed) == [waits, waits, waits, ended, runs, waits, waits]
+    taken = [store.queue.claim_waiting(lambda *_: 1, set())[0].previous for _ in range(4)]
+    assert [(row.method, row.seed) for row in taken if row] == [("bc", 3), ("copy-last", 1), ("bc", 0), ("bc", 2)]
+
+
+def test_seeds_that_were_computed_otherwise_are_not_taken_with_the_first(store: Store, cells: list[Cell]) -> None:
+    add(store, cells[:3])
+    store.start_run(cells[1].spec, 1, dataset_hash="d" * 64, device="cpu", repeat=True).finish(RunState.FINISHED)
+    claims = store.queue.claim_waiting(lambda *_: 3, set())
+    assert [claim.previous.seed for claim in claims if claim.previous] == [0, 2]
+    assert sorted(states(store).items()) == [(0, "running"), (1, "finished"), (2, "running")]
+    assert len(store.runs()) == 3
+
+
+def test_a_spec_that_is_left_alone_is_asked_about_once(store: Store, cells: list[Cell]) -> None:
+    add(store, cells)
+    asked: list[int] = []
+    without: set[str] = set()
+    for _ in range(2):
+        assert store.queue.claim_waiting(lambda row, waiting: asked.append(waiting) or 0, without) == []
+    assert (asked, without) == ([4], {cells[0].spec.hash()})
+
+
+def test_the_contents_of_the_queue_are_what_runs_and_what_comes_next(store: Store, cells: list[Cell]) -> None:
+    add(store, cells)
+    store.queue.claim_waiting(lambda *_: 2, set())
+    found = store.queue.contents(limit=3)
+    assert (found.waiting, found.running, found.dead) == (2, 2, 0)
+    assert [(row.seed, str(row.state)) for row in found.rows] == [(0, "running"), (1, "running"), (2, "queued")]
+    store.stale_seconds = 1e-6
+    found = store.queue.contents(limit=1)
+    assert (found.waiting, found.running, found.dead, len(found.rows)) == (2, 0, 2, 1)
 
 
 def change(store: Store, **columns: object) -> None:

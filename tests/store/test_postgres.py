@@ -15,7 +15,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import RunState, RunWriter, Store, connection, server
 from ssmail.store.connection import as_url, describe, make_engine, write
-from ssmail.store.queue import Claim
+from ssmail.store.queue import Claim, interrupt
 from tests.store.databases import SPEC, add
 from tests.store.postgres_server import PASSWORD, Server
 
@@ -224,6 +224,24 @@ def test_a_commit_whose_answer_is_lost_counts_once(step: str, remote: Store, mon
         writer.epoch(2, {"a": 1.0})
 
 
+def test_a_claimed_run_is_resumed_once_though_the_answer_is_lost(
+    remote: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer = start(remote)
+    writer.epoch(1, {"a": 1.0})
+    writer.finish(RunState.INTERRUPTED)
+    (claim,) = remote.queue.claim([(SPEC, 0)], lambda _: True)
+    assert isinstance(claim, Claim)
+    commits = lost_answer(remote, monkeypatch)
+    remote.resume_run(claim.run_id, 1, claim)
+    assert (commits(), remote.runs()[0].resumes) == (2, 1)
+    (new,) = remote.queue.claim([(SPEC, 1)], lambda _: True)
+    assert isinstance(new, Claim)
+    commits = lost_answer(remote, monkeypatch)
+    remote.resume_run(new.run_id, 0, new, dataset_hash="d" * 64)
+    assert (commits(), remote.runs()[-1].resumes) == (2, 0)
+
+
 def test_an_epoch_that_is_not_recognized_would_be_refused(remote: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control, for the epoch above; and an epoch that was there before is refused as in SQLite."""
     writer = start(remote)
@@ -288,7 +306,10 @@ def test_a_held_lock_is_one_sentence(server: Server, database: str, monkeypatch:
 
 def test_other_drivers_and_forms_of_a_url() -> None:
     assert as_url("postgresql://me@h/d").drivername == "postgresql+psycopg"
-    assert as_url("postgresql+pg8000://me@h/d").drivername == "postgresql+pg8000"
+    assert as_url("postgres://me@h/d").drivername == "postgresql+psycopg"
+    for driver in ("psycopg2", "pg8000"):
+        with pytest.raises(InputError, match=rf"{driver} is no driver that ssmail uses; write postgresql://"):
+            as_url(f"postgresql+{driver}://me@h/d")
     assert describe(make_engine(as_url("postgresql://me:pw@h/d"))) == "postgresql://me:***@h/d"
     found = server.arguments(make_url("postgresql+psycopg://h/d?connect_timeout=3&options=-cx%3D1"), 120)
     assert not found.keys() & {"connect_timeout", "options"}
@@ -332,3 +353,23 @@ def test_runs_that_wait_are_claimed_once_and_those_of_a_silent_worker_again(remo
     impatient = Store.open(url, stale_seconds=1e-6)
     assert len(impatient.queue.claim_waiting(lambda row, waiting: 24, set())) == 24
     impatient.close()
+
+
+def test_what_another_process_is_taking_over_is_left_to_it(server: Server, database: str, remote: Store) -> None:
+    """Two workers find the same silent run; the second one must not take it from the first."""
+    remote.queue.add([(SPEC, 0)])
+    (claim,) = remote.queue.claim_waiting(lambda *_: 1, set())
+    with server.connect(database) as admin:
+        admin.execute("UPDATE run SET heartbeat = '2026-01-01'")
+    (silent,) = remote.runs()
+    taken = "UPDATE run SET owner = 'queue-of-the-first', heartbeat = clock_timestamp() AT TIME ZONE 'utc'"
+    with server.connect(database) as admin, admin.transaction():
+        admin.execute(taken)
+        assert remote.queue.claim_waiting(lambda *_: 1, set()) == []
+    write(remote._engine, lambda connection, _: interrupt(connection, silent))  # as it was met before
+    assert remote.queue.claim_waiting(lambda *_: 1, set()) == []
+    (row,) = remote.runs()
+    assert (row.owner, str(row.state)) == ("queue-of-the-first", "running")
+    with server.connect(database) as admin:  # negative control
+        admin.execute("UPDATE run SET heartbeat = '2026-01-01'")
+    assert [found.run_id for found in remote.queue.claim_waiting(lambda *_: 1, set())] == [claim.run_id]

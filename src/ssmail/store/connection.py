@@ -25,12 +25,7 @@ BUSY_SECONDS = 120.0
 DRIVER_ERRORS = (DBAPIError, sqlite3.Error, UnicodeDecodeError)
 """What using a database raises; a UnicodeDecodeError about a damaged name in the schema, or SQLite's message on it."""
 BACKENDS = ("sqlite", "postgresql")
-DRIVERS = (
-    "sqlite",
-    "sqlite+pysqlite",
-    "postgresql",
-    *(f"postgresql+{name}" for name in ("psycopg", "psycopg2", "pg8000")),
-)
+DRIVERS = ("sqlite", "sqlite+pysqlite", "postgresql", "postgres", f"postgresql+{server.DRIVER}")
 _MIGRATIONS = Path(__file__).parent / "migrations"
 _READS: dict[str, Any] = {"isolation_level": "REPEATABLE READ", "postgresql_readonly": True}
 T = TypeVar("T")
@@ -54,7 +49,7 @@ def connect(where: str | Path, patience: float = 0.0) -> Engine:
     try:
         engine = make_engine(url)
     except (NoSuchModuleError, ImportError) as error:
-        raise server.missing_driver(url, name_of(url)) from error
+        raise server.missing_driver(name_of(url)) from error
     try:
         passes = server.passes if patience else server.is_coming
         revision = _attempts(engine, lambda _: _revision(engine), patience or BUSY_SECONDS, passes)
@@ -170,6 +165,10 @@ def as_url(where: str | Path) -> URL:
     except (ArgumentError, ValueError):
         shown = shortened(masked(where), 100)
         raise InputError(f"{shown} is neither a path nor a database URL such as sqlite:////tmp/ssmail.db") from None
+    if url.drivername.startswith("postgresql+") and url.drivername not in DRIVERS:
+        raise InputError(
+            f"{shortened(url.drivername, 60)} is no driver that ssmail uses; write postgresql://, for psycopg 3"
+        )
     if url.drivername not in DRIVERS:  # SQLAlchemy would import whatever package calls itself so
         raise InputError(
             f"{shortened(url.drivername, 60)} is no database that ssmail knows; use {' or '.join(BACKENDS)}"

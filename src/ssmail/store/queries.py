@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, select
+from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cast, func, literal_column, select
 
 from ssmail.config.changes import changes, with_changes
 from ssmail.config.spec import with_added_keys
@@ -22,6 +22,10 @@ HEARTBEAT_SECONDS = 5.0
 """Interval at which a running run records a heartbeat."""
 STALE_SECONDS = 30.0
 """A running run without a heartbeat for this long counts as dead."""
+MOST_AT_ONCE = 500
+"""Rows that a statement names or inserts."""
+MOST_COUNTED = 1000
+"""Waiting runs of a spec: more make no difference to how many of them a process takes."""
 
 
 @dataclass(frozen=True)
@@ -119,15 +123,23 @@ class ArtifactRow:
 
 
 def runs(
-    connection: Connection, *conditions: Any, damaged: set[DamagedRow] | None = None, for_update: bool = False
+    connection: Connection,
+    *conditions: Any,
+    damaged: set[DamagedRow] | None = None,
+    for_update: bool = False,
+    skip_locked: bool = False,
+    limit: int | None = None,
 ) -> list[RunRow]:
     """Return the runs that meet all conditions, newest last, without damaged rows, which are added to `damaged`.
 
     for_update: on a server, nobody else changes the rows until the transaction ends; in SQLite it is so anyway.
+    skip_locked: the same, without rows that somebody else is about to change. limit: read so many rows, the oldest.
     """
     query = select(*raw(schema.run)).where(*conditions).order_by(schema.run.c.started, schema.run.c.id)
-    if for_update:
-        query = query.with_for_update()
+    if limit is not None:
+        query = query.limit(_number(limit))
+    if for_update or skip_locked:
+        query = query.with_for_update(skip_locked=skip_locked)
     return [RunRow(**values) for values in sound_rows(connection, schema.run, query, damaged)]
 
 
@@ -180,21 +192,84 @@ def clock(connection: Connection) -> datetime:
 
 
 def silent_runs(
-    connection: Connection, stale_seconds: float = STALE_SECONDS, *, for_update: bool = False
+    connection: Connection,
+    stale_seconds: float = STALE_SECONDS,
+    *,
+    for_update: bool = False,
+    skip_locked: bool = False,
 ) -> list[RunRow]:
     """Return the RUNNING runs that are not alive (see RunRow.is_alive)."""
-    now, stale = clock(connection), timedelta(seconds=stale_seconds)
-    heartbeat = schema.run.c.heartbeat
-    silent = (heartbeat < now - stale) | (heartbeat > now + stale)
-    return runs(connection, schema.run.c.state == RunState.RUNNING, silent, for_update=for_update)
+    silent = is_silent(clock(connection), stale_seconds)
+    running = schema.run.c.state == RunState.RUNNING
+    return runs(connection, running, silent, for_update=for_update, skip_locked=skip_locked)
+
+
+def is_silent(now: datetime, stale_seconds: float) -> ColumnElement[bool]:
+    """Return the condition that a RUNNING run is not alive."""
+    heartbeat, stale = schema.run.c.heartbeat, timedelta(seconds=stale_seconds)
+    return (heartbeat < now - stale) | (heartbeat > now + stale)
 
 
 def newest_of_cell(connection: Connection, spec_hash: str, seed: int, *, for_update: bool = False) -> RunRow | None:
     """Return the newest run of the cell, or None. One that waits or stopped before it began counts as the oldest."""
-    cell = (schema.run.c.spec_hash == spec_hash, schema.run.c.seed == seed)
-    found = runs(connection, *cell, for_update=for_update)
-    begun = [row for row in found if row.has_begun or row.state.settled or row.state is RunState.RUNNING]
-    return next(reversed(begun or found), None)
+    return newest_of_cells(connection, spec_hash, [seed], for_update=for_update).get(seed)
+
+
+def newest_of_cells(
+    connection: Connection, spec_hash: str, seeds: Sequence[int], *, for_update: bool = False
+) -> dict[int, RunRow]:
+    """Return the newest run (see newest_of_cell) of those of the seeds that have one; MOST_AT_ONCE seeds at most."""
+    seed = schema.run.c.seed
+    # With the bounds, a server that expects few runs of the spec does not read all of them instead.
+    cells = (schema.run.c.spec_hash == spec_hash, seed.in_(seeds), seed >= min(seeds), seed <= max(seeds))
+    newest: dict[int, RunRow] = {}
+    for row in runs(connection, *cells, for_update=for_update):
+        if _counts(row) or row.seed not in newest or not _counts(newest[row.seed]):
+            newest[row.seed] = row
+    return newest
+
+
+def _counts(row: RunRow) -> bool:
+    """Whether a run has begun, is about to, or has ended."""
+    return row.has_begun or row.state.settled or row.state is RunState.RUNNING
+
+
+def longest_waiting(without: set[str]) -> Select[Any]:
+    """Return the query for the id of the run that has waited longest, but those; it reads one entry of the index."""
+    query = select(schema.run.c.id).where(schema.run.c.state == RunState.QUEUED, *_not_among(without))
+    return query.order_by(schema.run.c.started, schema.run.c.id).limit(_number(1)).with_for_update(skip_locked=True)
+
+
+def _not_among(without: set[str]) -> list[ColumnElement[bool]]:
+    """Return the conditions that leave out ids of runs, and hashes of specs, which are shorter."""
+    return [schema.run.c.id.not_in(without), schema.run.c.spec_hash.not_in(without)] if without else []
+
+
+def count_waiting(connection: Connection, spec_hash: str) -> int:
+    """Return how many runs of a spec wait; MOST_COUNTED if there are more."""
+    waiting = (
+        select(schema.run.c.id)
+        .where(schema.run.c.spec_hash == spec_hash, schema.run.c.state == RunState.QUEUED)
+        .limit(_number(MOST_COUNTED))
+    )
+    return int(connection.execute(select(func.count()).select_from(waiting.subquery())).scalar_one())
+
+
+def others_waiting(connection: Connection, first: RunRow, count: int, without: set[str]) -> list[RunRow]:
+    """Return up to `count` other waiting runs of the spec, without those that another process is about to take."""
+    if count == 0:
+        return []
+    same = (
+        schema.run.c.spec_hash == first.spec_hash,
+        schema.run.c.state == RunState.QUEUED,
+        schema.run.c.id != first.id,
+    )
+    return runs(connection, *same, *_not_among(without), limit=count, skip_locked=True)
+
+
+def _number(value: int) -> ColumnElement[int]:
+    """Return a number that is part of the statement: a server that plans for any limit would sort all that waits."""
+    return literal_column(str(int(value)))
 
 
 def resolve(connection: Connection, prefixes: Sequence[str]) -> list[str]:

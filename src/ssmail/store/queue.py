@@ -5,14 +5,13 @@ from the queue has an owner that begins with QUEUE; when its process stops or di
 """
 
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
-from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
-from sqlalchemy import Connection, Engine, Select, delete, insert, select, text, update
+from sqlalchemy import Connection, Engine, delete, insert, select, text, update
 
 from ssmail.config.spec import RunSpec
 from ssmail.store import queries, run_metadata, schema, server
@@ -22,7 +21,10 @@ from ssmail.store.schema import RunState, require_fitting
 
 QUEUE = "queue"
 _NOBODY = QUEUE.ljust(32, "-")
-_INDEX = "CREATE INDEX IF NOT EXISTS run_waiting ON run (state, started, id)"
+_INDEXES = (
+    "CREATE INDEX IF NOT EXISTS run_waiting ON run (state, started, id)",
+    "CREATE INDEX IF NOT EXISTS run_waiting_of_spec ON run (state, spec_hash, started, id)",
+)
 """Made with the first queue: a database of an earlier ssmail needs no upgrade, and an earlier ssmail still opens it."""
 
 
@@ -52,30 +54,51 @@ class Queue:
 
     def add(self, cells: Sequence[tuple[RunSpec, int]]) -> list[Enqueued]:
         """Let the cells (spec and seed) wait, and return what became of each. An unfinished run waits to be resumed."""
+        of_spec: dict[RunSpec, list[int]] = {}  # places among the cells
+        for place, (spec, _) in enumerate(cells):
+            of_spec.setdefault(spec, []).append(place)
 
         def add(connection: Connection, _again: bool) -> list[Enqueued]:
             server.lock_cells(connection)
-            connection.execute(text(_INDEX))
-            now = queries.clock(connection)
-            # a microsecond apart, so that they are taken in this order
-            times = (now + timedelta(microseconds=place) for place in count())
-            return [self._add(connection, *cell, time) for cell, time in zip(cells, times, strict=False)]
+            for index in _INDEXES:
+                connection.execute(text(index))
+            now, became = queries.clock(connection), [Enqueued.WAITING] * len(cells)
+            for spec, places in of_spec.items():
+                for first in range(0, len(places), queries.MOST_AT_ONCE):
+                    part = places[first : first + queries.MOST_AT_ONCE]
+                    seeds = {cells[place][1]: place for place in reversed(part)}  # the first place of each
+                    for seed, what in self._add(connection, spec, seeds, now).items():
+                        became[seeds[seed]] = what
+            return became
 
         return write(self._engine, add)
 
-    def _add(self, connection: Connection, spec: RunSpec, seed: int, now: datetime) -> Enqueued:
-        newest = queries.newest_of_cell(connection, spec.hash(), seed)
-        if newest is None:
-            insert_row(connection, new_row(spec, seed, RunState.QUEUED, _NOBODY), now)
-        elif newest.state.settled:
+    def _add(
+        self, connection: Connection, spec: RunSpec, places: Mapping[int, int], now: datetime
+    ) -> dict[int, Enqueued]:
+        """Let seeds of a spec wait, by place, a microsecond apart so that they are taken in this order."""
+        blank = new_row(spec, 0, RunState.QUEUED, _NOBODY)
+        newest = queries.newest_of_cells(connection, blank["spec_hash"], list(places))
+        new = []
+        for seed, place in places.items():
+            if seed not in newest:
+                time = now + timedelta(microseconds=place)
+                new.append({**blank, "id": uuid.uuid4().hex, "seed": seed, "started": time, "heartbeat": time})
+        if new:
+            connection.execute(insert(schema.run), new)
+        known = {seed: self._add_again(connection, row, now) for seed, row in newest.items()}
+        return dict.fromkeys(places, Enqueued.QUEUED) | known
+
+    def _add_again(self, connection: Connection, newest: RunRow, now: datetime) -> Enqueued:
+        """Let the newest run of a cell wait unless it is being computed or has ended."""
+        if newest.state.settled:
             return Enqueued.STORED
-        elif newest.state is RunState.QUEUED:
+        if newest.state is RunState.QUEUED:
             return Enqueued.WAITING
-        elif newest.is_alive(self._stale_seconds, now):
+        if newest.is_alive(self._stale_seconds, now):
             return Enqueued.RUNNING
-        else:
-            changes = {"state": RunState.QUEUED, "owner": _NOBODY, "finished": None}
-            connection.execute(update(schema.run).where(_unchanged(newest)).values(changes))
+        changes = {"state": RunState.QUEUED, "owner": _NOBODY, "finished": None}
+        connection.execute(update(schema.run).where(_unchanged(newest)).values(changes))
         return Enqueued.QUEUED
 
     def claim(
@@ -120,34 +143,29 @@ class Queue:
     def claim_waiting(self, most: Callable[[RunRow, int], int], without: set[str]) -> list[Claim]:
         """Claim the run that has waited longest, and others of its spec if `most` allows several; none if none waits.
 
-        `most` says how many to claim of a spec, given its first run and how many of its runs wait. The ids of runs that
-        cannot be used, because it says 0 or their rows are damaged, are added to `without`, whose runs are left alone.
-        Runs that were taken from the queue by a process that has died wait again.
+        `most` says how many to claim of a spec, given its first run and how many of its runs wait (1000 stands for
+        any more). The hashes of specs of which it says 0, and the ids of damaged runs, are added to `without`, whose
+        runs are left alone. Runs that were taken from the queue by a process that has died wait again. The time that
+        this takes does not depend on how many wait.
         """
-        run = schema.run
 
         def claim(connection: Connection, _again: bool) -> list[Claim]:
             now = queries.clock(connection)
-            for row in queries.silent_runs(connection, self._stale_seconds):
+            for row in queries.silent_runs(connection, self._stale_seconds, skip_locked=True):
                 if row.owner.startswith(QUEUE):
                     interrupt(connection, row)
-            while (run_id := connection.execute(longest_waiting(without)).scalar()) is not None:
-                first = next(iter(queries.runs(connection, run.c.id == run_id)), None)
+            while (run_id := connection.execute(queries.longest_waiting(without)).scalar()) is not None:
+                first = next(iter(queries.runs(connection, schema.run.c.id == run_id)), None)
                 if first is None:  # damaged
                     without.add(run_id)
                     continue
-                newest = queries.newest_of_cell(connection, first.spec_hash, first.seed)
-                if newest is not None and newest.id != first.id:  # a merge or --resume never brought another run
-                    _leave_to(connection, first, newest)
-                    continue
-                same = (run.c.spec_hash == first.spec_hash, run.c.state == RunState.QUEUED)
-                wanted = most(first, queries.count_rows(connection, run, *same))
+                wanted = most(first, queries.count_waiting(connection, first.spec_hash))
                 if wanted == 0:
-                    without.add(run_id)
+                    without.add(first.spec_hash)
                     continue
-                others = queries.runs(connection, *same, run.c.id != run_id, run.c.id.not_in(without))
-                claims = [_take(connection, row, now) for row in (first, *others[: wanted - 1])]
-                return [claim for claim in claims if isinstance(claim, Claim)]
+                others = queries.others_waiting(connection, first, wanted - 1, without)
+                if claims := _take_waiting(connection, [first, *others], now):
+                    return claims
             return []
 
         return write(self._engine, claim)
@@ -185,19 +203,46 @@ class Queue:
 
         return write(self._engine, undo)
 
-    def rows(self) -> tuple[list[RunRow], datetime]:
-        """Return the runs that wait or are running, the oldest first, and the time of the database's clock."""
-        states = schema.run.c.state.in_([RunState.QUEUED, RunState.RUNNING])
-        return read(self._engine, lambda connection: (queries.runs(connection, states), queries.clock(connection)))
+    def contents(self, limit: int | None = None) -> "Contents":
+        """Return how many runs wait or are running, and the first `limit` of them."""
+        run = schema.run
+
+        def look(connection: Connection) -> Contents:
+            now = queries.clock(connection)
+            running, waiting = run.c.state == RunState.RUNNING, run.c.state == RunState.QUEUED
+            dead = queries.count_rows(connection, run, running, queries.is_silent(now, self._stale_seconds))
+            alive = queries.count_rows(connection, run, running) - dead
+            rows = queries.runs(connection, running, limit=limit)
+            rows += queries.runs(connection, waiting, limit=None if limit is None else limit - len(rows))
+            return Contents(rows, queries.count_rows(connection, run, waiting), alive, dead, now)
+
+        return read(self._engine, look)
 
 
-def longest_waiting(without: set[str]) -> Select[Any]:
-    """Return the query for the id of the run that has waited longest, but those; it reads one entry of the index."""
-    run = schema.run
-    query = select(run.c.id).where(run.c.state == RunState.QUEUED)
-    if without:
-        query = query.where(run.c.id.not_in(without))
-    return query.order_by(run.c.started, run.c.id).limit(1).with_for_update(skip_locked=True)
+class Contents(NamedTuple):
+    """How many runs of a database wait, are running or have a process that died; and the first of them.
+
+    rows: those that are running or dead, then those that wait, in the order in which they are taken. now: the time of
+    the database's clock.
+    """
+
+    rows: list[RunRow]
+    waiting: int
+    running: int
+    dead: int
+    now: datetime
+
+
+def _take_waiting(connection: Connection, rows: Sequence[RunRow], now: datetime) -> list[Claim]:
+    """Claim those of the waiting runs of a spec whose cells have no newer run, after a merge or --resume never."""
+    claims = []
+    for row in rows:
+        newest = queries.newest_of_cell(connection, row.spec_hash, row.seed)
+        if newest is not None and newest.id != row.id:
+            _leave_to(connection, row, newest)
+        elif isinstance(taken := _take(connection, row, now), Claim):
+            claims.append(taken)
+    return claims
 
 
 def new_row(spec: RunSpec, seed: int, state: RunState, owner: str) -> dict[str, Any]:
@@ -238,7 +283,7 @@ def interrupt(connection: Connection, row: RunRow) -> None:
     error = (
         f"its last heartbeat, of {last}, was ahead of the clock" if ahead else f"its process fell silent after {last}"
     )
-    end(connection, row.id, RunState.INTERRUPTED, error)
+    end(connection, row.id, RunState.INTERRUPTED, error, row.owner)  # unless another process took it meanwhile
 
 
 def end(connection: Connection, run_id: str, state: RunState, error: str, owner: str | None = None) -> None:

@@ -17,7 +17,7 @@ from ssmail.errors import InputError, SsmailError, shortened
 from ssmail.store import arrays, queries, run_metadata, schema, server
 from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
 from ssmail.store.connection import connect, describe, read, reading, write
-from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
+from ssmail.store.queries import MOST_AT_ONCE, STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.queue import Claim, Queue, end, insert_row, interrupt, new_row
 from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
@@ -115,9 +115,15 @@ class Store:
         self.close()  # open connections would still read a file that has been removed
         if self._engine.dialect.name == "sqlite" and not Path(self.where).exists():
             return []
-        wanted = set(run_ids)
+        wanted = list(dict.fromkeys(run_ids))
+
+        def find(connection: Connection) -> list[RunRow]:
+            parts = (wanted[first : first + MOST_AT_ONCE] for first in range(0, len(wanted), MOST_AT_ONCE))
+            found = [row for part in parts for row in queries.runs(connection, schema.run.c.id.in_(part))]
+            return sorted(found, key=lambda row: (row.started, row.id))
+
         try:
-            return [row for row in read(self._engine, queries.runs) if row.id in wanted]
+            return read(self._engine, find)
         except SsmailError:
             return []
 
@@ -187,7 +193,7 @@ class Store:
         `from_step`.
         """
         owner = claim.owner if claim else uuid.uuid4().hex
-        claimed = self.run(run_id) if claim else None
+        met: list[RunRow] = []  # the row by attempt; the first may have been committed, if only the answer was lost
 
         def resume(connection: Connection, again: bool) -> RunRow:
             row = queries.one_run(connection, run_id, for_update=True)
@@ -198,7 +204,8 @@ class Store:
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
-            before = claimed or row  # as it was before an attempt of which the answer was lost
+            met.append(row)
+            before = met[0] if claim else row
             changes = {
                 "state": RunState.RUNNING,
                 "error": None,

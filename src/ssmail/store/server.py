@@ -15,7 +15,6 @@ from sqlalchemy.exc import DBAPIError, OperationalError
 from ssmail.errors import InputError, SsmailError, shortened
 
 DRIVER = "psycopg"
-_LIBPQ = ("psycopg", "psycopg2")  # drivers that understand libpq's parameters
 _SCHEMA_LOCK, _CELL_LOCK = 0x55314A11_0001, 0x55314A11_0002  # of ssmail; a server has 2**64 for all programs
 _CONFLICTS = ("40001", "40P01")  # serialization failure, deadlock
 _GONE = ("57P01", "57P02", "57P03")  # shut down by an administrator, crashed, starting or stopping
@@ -24,21 +23,17 @@ _JITTER = random.SystemRandom()  # of no use for results, which are from seeded 
 
 
 def with_driver(url: URL) -> URL:
-    """Return the URL with psycopg as the driver if it names none."""
-    return url.set(drivername=f"postgresql+{DRIVER}") if url.drivername == "postgresql" else url
+    """Return the URL of a database on a server with psycopg 3 as the driver, also if it names none."""
+    return url.set(drivername=f"postgresql+{DRIVER}")
 
 
-def missing_driver(url: URL, where: str) -> InputError:
+def missing_driver(where: str) -> InputError:
     """Return the error about a driver that is not installed."""
-    name = url.get_driver_name()
-    package = "'ssmail[postgres]'" if name == DRIVER else name
-    return InputError(f"no driver for the database URL {where} is installed; run `pip install {package}`")
+    return InputError(f"no driver for the database URL {where} is installed; run `pip install 'ssmail[postgres]'`")
 
 
 def arguments(url: URL, lock_seconds: float) -> dict[str, Any]:
     """Return the connection's parameters that the URL leaves open: how soon a dead server or a held lock shows."""
-    if url.get_driver_name() not in _LIBPQ:
-        return {}
     wanted = {
         "connect_timeout": 10,
         "keepalives_idle": 30,
@@ -120,7 +115,5 @@ def _cannot_connect(error: DBAPIError) -> bool:
 
 def _state(error: DBAPIError) -> str:
     """Return the SQLSTATE of five characters; empty if there is none."""
-    for name in ("sqlstate", "pgcode"):  # of psycopg, of psycopg2
-        if isinstance(found := getattr(error.orig, name, None), str):
-            return found
-    return ""
+    found = getattr(error.orig, "sqlstate", None)
+    return found if isinstance(found, str) else ""

@@ -110,7 +110,7 @@ def opened(where: URL | Path) -> Iterator[Engine]:
     try:
         engine = make_engine(url)
     except ImportError as error:
-        raise missing_driver(url, name_of(url)) from error
+        raise missing_driver(name_of(url)) from error
     try:
         yield engine
     finally:
