@@ -6,6 +6,7 @@ Its sections are in `ssmail.config.sections`. A spec defines everything about a 
 import difflib
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from itertools import chain
@@ -106,6 +107,8 @@ class RunSpec(Frozen):
             raise ValueError(f"adversarial.reward probability is for gail alone, not {self.method}; leave it out")
         if self.variational and self.variational.action_bound and not self.variational.action_step:
             raise ValueError("variational.action_bound bounds nothing without variational.action_step; set both")
+        if self.variational and (self.variational.action_bound or math.inf) < (self.variational.action_step or 0):
+            raise ValueError("variational.action_bound is less than variational.action_step; raise it")
         return self
 
     @property

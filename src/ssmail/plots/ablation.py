@@ -140,7 +140,7 @@ def collect(
     metrics = tuple(dict.fromkeys(metrics))
     return AblationRecord(
         keys=tuple(keys),
-        panels=tuple(_panel(store, selection.groups, metric, statistic) for metric in metrics),
+        panels=tuple(collect_panel(store, selection.groups, metric, statistic) for metric in metrics),
         statistic=statistic,
         settings=settings_of(selection.runs),
         provenance=Provenance.of(
@@ -153,7 +153,8 @@ def collect(
     )
 
 
-def _panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statistic) -> Panel:
+def collect_panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statistic) -> Panel:
+    """Collect a metric of the runs of each group. Raises InputError if none of them has it."""
     runs = [run for group in groups for run in group.runs]
     known, _ = known_values(store, runs, [metric])
     if not known:
