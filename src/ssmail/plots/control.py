@@ -50,27 +50,33 @@ class ControlRecord:
     @property
     def caption(self) -> str:
         """What the figure shows, in a few sentences that a paper could use."""
-        arms = [column.group for column in self.columns.panels[0].columns]
-        seeds = "; ".join(f"{group.label} {spans([run.seed for run in group.runs])}" for group in arms)
-        without = [arm for arm in self.arms if arm not in [group.label for group in arms]]
+        groups = [column.group for column in self.columns.panels[0].columns]
+        seeds = {group.label: spans([run.seed for run in group.runs]) for group in groups}
+        alike = len(set(seeds.values())) == 1
+        told = seeds[groups[0].label] if alike else ", ".join(f"{own} of {arm}" for arm, own in seeds.items())
+        metrics = listed((panel.metric for panel in self.columns.panels), "and")
+        lacking = f" No runs yet of {listed(self.without_runs, 'and')}." if self.without_runs else ""
         return (
-            f"Control {self.control}: {self.question} {' and '.join(panel.metric for panel in self.columns.panels)} "
-            f"(profile {self.columns.settings}). Points are single runs, seeds of each arm: {seeds}; beside them "
-            f"{self.columns.statistic.words}." + (f" No runs yet of {listed(without, 'and')}." if without else "")
+            f"Control {self.control}: {self.question} {metrics} of each arm (profile {self.columns.settings}). Points "
+            f"are single runs, seeds {told}; beside them {self.columns.statistic.words}.{lacking}"
         )
+
+    @property
+    def without_runs(self) -> list[str]:
+        """The arms that have no runs."""
+        drawn = [column.group.label for column in self.columns.panels[0].columns]
+        return [arm for arm in self.arms if arm not in drawn]
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Which arms have no runs, which metrics are not stored, and how each arm compares with the first one."""
-        drawn = [column.group.label for column in self.columns.panels[0].columns]
-        without = [arm for arm in self.arms if arm not in drawn]
-        notes = [f"no runs yet of {listed(without, 'and')}."] if without else []
+        notes = [f"no runs yet of {listed(self.without_runs, 'and')}."] if self.without_runs else []
         notes += [f"{metric} is stored by none of these runs, so it is not drawn." for metric in self.lacking]
         for panel in self.columns.panels:
             values = {arm: p for arm, p in self.p_values(panel).items() if not np.isnan(p)}
             if values:
                 told = ", ".join(f"{arm} {number(p, 2)}" for arm, p in values.items())
-                notes.append(f"{panel.metric}, two-sided exact test against {self.arms[0]}: {told}.")
+                notes.append(f"{panel.metric} against {self.arms[0]}, two-sided p: {told}.")
         return (*self.columns.notes, *notes)
 
     def p_values(self, panel: Panel) -> dict[str, float]:
