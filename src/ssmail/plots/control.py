@@ -107,17 +107,18 @@ def select(
     data.
     """
     found, runs = read_control(name), [run for run in store.runs() if run.state.settled]
-    choices = []
+    choices, refused = [], None
     for candidate in [profile] if profile else load_experiments().profiles:
         try:
             specs = arm_specs(name, candidate, overrides)
-        except InputError:
-            if profile:
-                raise
-            continue  # a profile in which two arms are the same
+        except InputError as error:  # two arms are the same in this profile, or no profile takes these overrides
+            refused = error
+            continue
         groups = _groups({arm: spec.hash() for arm, spec in specs.items()}, runs)
         if groups:
             choices.append(groups)
+    if not choices and refused and (profile or overrides):
+        raise refused
     if not choices:
         words = ("--profile", profile) if profile else ()
         command = command_line("ssmail", "control", name, *words, *(w for text in overrides for w in ("--set", text)))
