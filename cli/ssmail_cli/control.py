@@ -113,18 +113,22 @@ def plot(
 
 
 def chosen_controls(names: Sequence[str]) -> list[str]:
-    """Return the named controls, each once; `all` stands for every one. Raises InputError for `all` and others."""
-    from ssmail.config.controls import EVERY, control_names
+    """Return the named controls, each once; `all` stands for every one.
+
+    Raises InputError for `all` and others, and for a control that is unknown or wrong.
+    """
+    from ssmail.config import controls
 
     chosen = list(dict.fromkeys(names))
-    if EVERY not in chosen:
-        return chosen
-    if len(chosen) > 1:
-        raise InputError(f"{EVERY} is every control already; give it alone.")
-    found = control_names()
-    if not found:
-        raise InputError("the experiments.yaml in use has no controls; add some, or use the one of ssmail.")
-    return found
+    if controls.EVERY in chosen:
+        if len(chosen) > 1:
+            raise InputError(f"{controls.EVERY} is every control already; give it alone.")
+        chosen = controls.control_names()
+        if not chosen:
+            raise InputError("the experiments.yaml in use has no controls; add some, or use the one of ssmail.")
+    for name in chosen:
+        controls.control(name)
+    return chosen
 
 
 def _rows() -> list[dict[str, Any]]:
