@@ -61,6 +61,7 @@ docs/database
 docs/results
 docs/paper
 docs/claims
+docs/controls
 docs/experiments
 results/reference/README
 results/reference/report
