@@ -62,6 +62,7 @@ docs/cluster
 docs/results
 docs/paper
 docs/claims
+docs/controls
 docs/experiments
 results/reference/README
 results/reference/report

@@ -62,6 +62,16 @@ def ablations() -> list[str]:
     return _of_experiments(lambda experiments: experiments.ablations)
 
 
+def controls() -> list[str]:
+    """Return the controls of experiments.yaml, and the word for all of them."""
+    return [*_of_experiments(lambda experiments: experiments.controls), "all"]
+
+
+def controls_and_words() -> list[str]:
+    """Return what `ssmail control` takes: the controls, and the words for all of them and for their table."""
+    return [*controls(), "list"]
+
+
 def keys() -> list[str]:
     """Return the keys of the spec: ["data.path", ...]."""
     return _of_experiments(lambda experiments: flatten(experiments.defaults))

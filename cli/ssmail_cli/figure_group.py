@@ -20,16 +20,19 @@ class FigureGroup(Commands):
     `plot fig4 --out X fig5 --profile quick` is read as `plot --out X` followed by the lines `fig4 --profile quick` and
     `fig5 --profile quick`: the group has the options in common, and every command parses all the others, so click
     refuses one that the command does not have. Only an option in SHARED may be meant for some of the commands alone.
+    A command with an argument, as `plot control modes`, takes all names that come after its own.
     """
 
     SHARED = frozenset({"--runs", "--profile", "--stat"})
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Split the line, and let click parse the options in common and, for a single command, its line."""
-        names, given = self._split(args, ctx.resilient_parsing)
+        names, given, words = self._split(args, ctx.resilient_parsing)
         common = {option for parameter in self.params for option in parameter.opts}
         own = {key: tokens for key, tokens in given.items() if key not in common}
-        lines = ctx.meta["lines"] = [[name, *self._options_of(name, names, own)] for name in names]
+        lines = ctx.meta["lines"] = [
+            [name, *(words if self._takes_words(name) else ()), *self._options_of(name, names, own)] for name in names
+        ]
         first = lines[0] if lines else [token for tokens in own.values() for token in tokens]
         return super().parse_args(ctx, [*(token for key in given if key in common for token in given[key]), *first])
 
@@ -51,8 +54,13 @@ class FigureGroup(Commands):
             with context:
                 context.command.invoke(context)
 
-    def _split(self, args: Sequence[str], completing: bool) -> tuple[list[str], dict[str, list[str]]]:
-        """Return the names, without aliases and repetitions, and the tokens of each option by its key, as --out.
+    def _takes_words(self, name: str) -> bool:
+        command = self.commands.get(name)
+        return command is not None and any(parameter.param_type_name == "argument" for parameter in command.params)
+
+    def _split(self, args: Sequence[str], completing: bool) -> tuple[list[str], dict[str, list[str]], list[str]]:
+        """Return the names, without aliases and repetitions, the tokens of each option by its key, as --out, and the
+        words after the name of a command that takes them.
 
         Raises InputError for an option without its value, except when the shell is completing the line.
         """
@@ -60,10 +68,14 @@ class FigureGroup(Commands):
         is_flag = {key: getattr(parameter, "is_flag", False) for parameter in parameters for key in parameter.opts}
         is_flag |= {"-h": True, "--help": True}
         names: dict[str, None] = {}
+        words: list[str] = []
         given: dict[str, list[str]] = {}
         tokens = iter(args)
         for token in tokens:
             if not token.startswith("-"):
+                if names and self._takes_words(next(reversed(names))):
+                    words.append(token)
+                    continue
                 names[FIGURES[token].name if token in FIGURES else token] = None
                 continue
             option = given.setdefault(token.partition("=")[0], [])
@@ -74,7 +86,7 @@ class FigureGroup(Commands):
                     option.append(value)
                 elif token in is_flag and not completing:
                     raise InputError(f"option '{token}' requires an argument.")
-        return list(names), given
+        return list(names), given, words
 
     def _options_of(self, name: str, names: Sequence[str], given: dict[str, list[str]]) -> list[str]:
         """Return the tokens for one of the commands: all but SHARED options that only others of them have."""

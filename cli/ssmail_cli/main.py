@@ -14,6 +14,7 @@ from ssmail_cli import (
     claims,
     completion,
     config,
+    control,
     datasets,
     db,
     explain,
@@ -60,6 +61,7 @@ app.command("train")(train.train)
 app.command("ablate")(train.ablate)
 app.command("ablate-alpha", cls=train.AblateAlias, help="Short for `ssmail ablate alpha`.")(train.ablate)
 app.command("ablate-beta", cls=train.AblateAlias, help="Short for `ssmail ablate beta`.")(train.ablate)
+app.command("control")(control.control)
 app.command("reproduce")(reproduce.reproduce)
 app.command("worker")(work_queue.worker)
 app.command("queue")(work_queue.queue)

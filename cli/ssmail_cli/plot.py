@@ -9,7 +9,7 @@ import typer
 
 from ssmail.errors import ExitCode, InputError, stored_values, unknown_name
 from ssmail.paper.results import FIGURES
-from ssmail_cli import completion, options
+from ssmail_cli import completion, control, options
 from ssmail_cli.figure_group import ALL, FigureCommand, FigureGroup
 from ssmail_cli.options import open_store, parse_statistic
 from ssmail_cli.output import note, say
@@ -337,6 +337,9 @@ def skeleton(
         path = ctx.obj.out / f"{record.stem}.gif"
         skeleton_plot.save_film(record, path)
         say(path)
+
+
+app.command("control", epilog=EPILOG)(control.plot)
 
 
 def _print_notes(name: str, record: "FigureRecord") -> None:

@@ -129,6 +129,9 @@ def test_a_label_leaves_the_hash_of_runs_from_before_labels_as_it_was() -> None:
     assert values["model"].pop("standardize") is False
     assert values["model"].pop("centre_relative") is False
     assert values["model"].pop("discriminator_waves") == []
+    assert values["model"].pop("discriminator_velocities") is True
+    assert values["self_supervision"].pop("discriminator_weight") == 1
+    assert values["adversarial"].pop("reward") == "own"
     assert values["sac"].pop("expansion_steps") == 0
     assert values["sac"].pop("expansion_start") == 0
     assert values["sac"].pop("finite_horizon") is False
@@ -155,6 +158,37 @@ def test_stored_runs_of_nri_embed_step_by_step() -> None:
     assert published.variational.encoder_window == published.forecast.observed == 50
     assert published.hash() != any_length.hash()
     assert build_spec("nri", "yjunction", "quick").variational.encoder_window is None
+
+
+@pytest.mark.parametrize("method", ["nri", "dnri"])
+def test_stored_runs_of_nri_and_dnri_are_unbounded_and_draw_each_edge(method: str) -> None:
+    """They have no keys for that; every one of these, once it has another value, is another spec."""
+    now = build_spec(method, "yjunction", "smoke")
+    values = now.model_dump(mode="json")
+    later = {"graph_noise": "edge", "graph_resample": "step", "action_step": None, "action_bound": None}
+    assert {key: values["variational"].pop(key) for key in later} == later
+    assert specs.spec_hash(values) == now.hash()
+    assert RunSpec.model_validate(specs.with_added_keys(values)) == now
+    changes = ("graph_noise=shared", "graph_resample=trajectory", "action_step=1")
+    other = [build_spec(method, "yjunction", "smoke", [f"variational.{change}"]).hash() for change in changes]
+    assert len({now.hash(), *other}) == 4
+
+
+@pytest.mark.parametrize(
+    ("method", "overrides", "sentence"),
+    [
+        ("ssail", ["adversarial.reward=probability"], "adversarial.reward probability is for gail alone, not ssail; "),
+        ("wail", ["adversarial.reward=probability"], "adversarial.reward probability is for gail alone, not wail; "),
+        ("dnri", ["variational.action_bound=3"], "bounds nothing without variational.action_step; set both"),
+        ("dnri", ["variational.action_bound=1", "variational.action_step=2"], "is less than variational.action_step; "),
+    ],
+)
+def test_settings_that_mean_nothing_together_are_refused(method: str, overrides: list[str], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        build_spec(method, "yjunction", "smoke", overrides)
+    assert build_spec("gail", "yjunction", "smoke", ["adversarial.reward=probability"]).adversarial.reward != "own"
+    bounded = ["variational.action_bound=2", "variational.action_step=1"]
+    assert build_spec("dnri", "yjunction", "smoke", bounded).variational.action_bound == 2
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,10 @@ COMMANDS = (
     "ablate beta --dry-run --profile smoke",
     "ablate label --dry-run --profile paper --env letters",
     "ablate curriculum --dry-run",
+    "control list",
+    "control all --dry-run --profile smoke",
+    "control averaging --dry-run --profile paper",
+    "plot control dnri-training --out {folder}/figures",
     "reproduce --dry-run --profile smoke",
     "runs list --figure fig6",
     "runs list --figure fig4",
@@ -117,13 +121,34 @@ ENTRIES = {
             ("data.path", ["\t"]),
         )
     ],
+    "controls": [
+        {"replay": {**CONTENT["controls"]["replay"], **change}}
+        for change in (
+            {"arms": [1, 2]},
+            {"arms": {1: {"method": "ssail"}, "b": {"method": "gail"}}},
+            {"arms": {"a": ["ssail"], "b": {"method": "gail"}}},
+            {"arms": {"a": {"method": ["ssail"]}, "b": {"method": "gail"}}},
+            {"arms": {"a": {"method": "ssail"}, "../b": {"method": "gail"}}},
+            {"arms": {"a": {"method": "ssail"}, "b": {"method": "gail", "settings": [1]}}},
+            {"arms": {"a": {"method": "ssail"}, "b": {"method": "gail", "settings": {"method": "wail"}}}},
+            {"arms": {"a": {"method": "ssail"}, "b": {"method": "gail", "settings": {"sac": {"gamma": {}}}}}},
+            {"arms": {"a" * 5000: {"method": "ssail"}, "b": {"method": "gail"}}},
+            {"claim": {"C1": 1}},
+            {"question": ["why"]},
+            {"metrics": ["\x1b[31m" * 500]},
+            {"environment": {}},
+        )
+    ],
 }
 
 
 @pytest.mark.parametrize(("section", "entries"), [(name, entry) for name, found in ENTRIES.items() for entry in found])
 def test_an_entry_of_a_wrong_kind(folder: Path, section: str, entries: dict[str, Any]) -> None:
     write(folder / "experiments.yaml", **{section: {**CONTENT[section], **entries}})
-    for command in ("ablate beta --dry-run --profile smoke", "runs list --figure fig6", "claims --only C3"):
+    commands = ("ablate beta --dry-run --profile smoke", "runs list --figure fig6", "claims --only C3")
+    if section == "controls":
+        commands = ("control", "control replay --dry-run --profile smoke", "plot control replay --profile smoke")
+    for command in commands:
         hold(folder, *command.split(), "--db", folder / "ssmail.db")
 
 

@@ -7,7 +7,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ssmail.losses.adversarial import gail_loss, gail_reward, gradient_penalty, ssail_reward, wail_loss, wail_reward
+from ssmail.losses.adversarial import (
+    gail_loss,
+    gail_probability,
+    gail_reward,
+    gradient_penalty,
+    ssail_reward,
+    wail_loss,
+    wail_reward,
+)
 
 
 def outputs(*values: float) -> torch.Tensor:
@@ -54,6 +62,16 @@ def test_gail_reward_is_minus_log_of_one_minus_the_probability() -> None:
     torch.testing.assert_close(gail_reward(logits), -torch.log(1 - torch.sigmoid(logits)))
     assert float(gail_reward(torch.tensor(0.0))) == pytest.approx(math.log(2))
     assert torch.isfinite(gail_reward(torch.tensor([-1e4, 1e4]))).all()
+
+
+def test_gail_as_a_probability_is_flat_where_the_discriminator_is_sure() -> None:
+    logits = torch.tensor([-20.0, math.log(3), 20.0], requires_grad=True)
+    reward = gail_probability(logits)
+    torch.testing.assert_close(reward.detach(), torch.tensor([0.0, 0.75, 1.0]), atol=1e-6, rtol=0)
+    (slope,) = torch.autograd.grad(reward.sum(), logits)
+    torch.testing.assert_close(slope, torch.tensor([0.0, 0.1875, 0.0]), atol=1e-6, rtol=0)
+    (own,) = torch.autograd.grad(gail_reward(logits).sum(), logits)
+    assert float(own[2]) > 0.99  # negative control: gail's own reward still rises there
 
 
 def test_wail_loss_is_the_negative_gap() -> None:

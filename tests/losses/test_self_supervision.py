@@ -116,6 +116,12 @@ def test_terms_of_the_loss() -> None:
     loss, terms = ssail_loss(*outputs, torch.tensor([-1.0, 0.5]))
     assert {k: float(v) for k, v in terms.items()} == {"generated": 0.25, "expert": 0.5625, "self_supervised": 0.625}
     assert float(loss) == 0.25 + 0.5625 + 0.625
+    half, weighed = ssail_loss(*outputs, torch.tensor([-1.0, 0.5]), 0.5)
+    assert float(half) == 0.25 + 0.5625 + 0.3125
+    assert float(weighed["self_supervised"]) == 0.3125
+    squared, terms = ssail_loss(*outputs[:2])
+    assert float(squared) == 0.25 + 0.5625
+    assert set(terms) == {"generated", "expert"}
 
 
 def test_assignment_spreads_over_the_modes() -> None:

@@ -171,3 +171,33 @@ def test_the_discriminator_reads_waves_of_positions_and_is_the_plain_one_without
     assert torch.equal(made(NO_WAVES)(x, action), plain(x, action))
     assert waving(x, action).shape == plain(x, action).shape
     assert waving.edges.first.sender.in_features == plain.edges.first.sender.in_features + 4
+
+
+@pytest.mark.parametrize("start", [False, True])
+def test_a_blind_discriminator_sees_no_velocity(start: bool) -> None:
+    """Neither that of the state, nor that of the first state, nor the action; everything else still counts."""
+    features = Features(time=True, start=start, steps=5, agents=3)
+    waves = Waves(2, (3.0,))
+    size, generator = features.size(4), torch.Generator().manual_seed(0)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        made = {
+            seen is None: Discriminator(size + 2, 8, waves, seen) for seen in (None, features.without_velocities(4))
+        }
+    states, action = torch.randn(2, 5, 3, 4, generator=generator), torch.randn(2, 5, 3, 2, generator=generator)
+
+    def scores(network: Discriminator, states: Tensor, action: Tensor) -> Tensor:
+        x = features(states, states[:, 0])
+        every, own = network(x, action), network.score_agent(1, x[..., 1, :], x, action)
+        torch.testing.assert_close(own, every[..., 1])
+        return every.detach()
+
+    for axis, is_velocity in enumerate((False, False, True, True)):
+        other = states.clone()
+        other[..., axis] += 1
+        for reads_all, network in made.items():
+            same = torch.equal(scores(network, states, action), scores(network, other, action))
+            assert same is (is_velocity and not reads_all)
+    for reads_all, network in made.items():
+        assert torch.equal(scores(network, states, action), scores(network, states, action + 1)) is not reads_all
+    assert set(made[True].state_dict()) == set(made[False].state_dict())  # checkpoints are alike

@@ -22,6 +22,7 @@ SPEC = ModelSpec(
     encoder_hidden=6,
     discriminator_hidden=None,
     discriminator_waves=(),
+    discriminator_velocities=True,
     edge_types=3,
     first_type_is_none=True,
     own_input=True,

@@ -1,5 +1,8 @@
 """Each agent's own units, and which velocities it can choose."""
 
+import math
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -56,6 +59,19 @@ def test_actions_stay_within_each_agents_own_reach(seed: int, noise: float) -> N
     assert bool(((action - usual.velocity.mean).abs() <= 3 * away * (1 + 1e-5)).all())
     for_all = ActionBounds.of(spec)
     assert (float(for_all.step), float(for_all.low), float(for_all.high)) == (1.0, -3.0, 3.0)
+
+
+def test_a_limit_is_the_actors_and_leaves_small_changes_alone() -> None:
+    """One agent whose velocity has mean 1 and spread 0.5: a step of 1 spread is 0.5, and a bound of 3 spreads 1.5."""
+    usual = Normalization(torch.tensor([[0.0, 1.0]]), torch.tensor([[1.0, 0.5]]))
+    bounds = ActionBounds.within(1.0, 3.0, usual)
+    assert [float(part) for part in (bounds.step, bounds.low, bounds.high)] == [0.5, -0.5, 2.5]
+    velocity = torch.tensor([1.0, 1.0, 1.0, 9.0]).view(-1, 1, 1)
+    wanted = torch.tensor([1.001, 1.5, 100.0, 100.0]).view(-1, 1, 1)
+    limited = bounds.limit(wanted, velocity).flatten().tolist()
+    assert limited == pytest.approx([1.001, 1 + 0.5 * math.tanh(1), 1.5, 2.5], abs=1e-6)
+    far = ActionBounds.within(1.0, math.inf, usual).limit(wanted, velocity).flatten().tolist()
+    assert far[3] == pytest.approx(9.5)  # negative control: without a bound it may go on from any velocity
 
 
 def test_mocap_reads_each_joint_in_its_own_units_and_yjunction_does_not() -> None:

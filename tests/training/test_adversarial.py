@@ -200,3 +200,49 @@ def test_a_truncated_gradient_of_the_encoder_changes_no_value() -> None:
     torch.testing.assert_close(whole[1], part[1])
     assert 0 < float(part[2].norm()) < float(whole[2].norm())
     torch.testing.assert_close(more[2], whole[2])
+
+
+def test_without_its_weight_the_discriminator_never_meets_tau_alpha(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The actor-critic still does, unless its share is 0: then no alpha is drawn at all."""
+    from ssmail.training import adversarial
+
+    drawn: list[int] = []
+    real = adversarial.sample_alpha
+
+    def counted(batch: int, *arguments: object) -> torch.Tensor:
+        drawn.append(batch)
+        return real(batch, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(adversarial, "sample_alpha", counted)
+    off, share = "self_supervision.discriminator_weight=0", "self_supervision.actor_share=0"
+    for overrides, batches in (((), [4, 2]), ((off,), [2]), ((share,), [4, 0]), ((off, share), [0])):
+        drawn.clear()
+        logs = updated(training(*overrides))
+        assert drawn == batches
+        assert ("discriminator/self_supervised" in logs) is (off not in overrides)
+
+
+def test_the_weight_of_tau_alpha_scales_its_term() -> None:
+    once, twice = (updated(training(f"self_supervision.discriminator_weight={weight}")) for weight in (1, 2))
+    term = "discriminator/self_supervised"
+    torch.testing.assert_close(twice[term], 2 * once[term])
+    torch.testing.assert_close(twice["discriminator/loss"] - once["discriminator/loss"], once[term])
+
+
+def test_gails_reward_may_be_its_probability() -> None:
+    own, probability = (learner(*given, method="gail")[0] for given in ((), ("adversarial.reward=probability",)))
+    x, actions = torch.randn(4, 5, 3, 5), torch.randn(4, 5, 3, 2)
+    found = probability.reward(x, actions)
+    torch.testing.assert_close(found, torch.sigmoid(probability.discriminator(x, actions)))
+    assert not torch.allclose(found, own.reward(x, actions))
+
+
+def test_a_discriminator_without_velocities_trains_for_several_seeds_as_for_one() -> None:
+    given = ("model.discriminator_velocities=false", "model.start_input=true")
+    latest = training(*given).generate(0.0)[0]
+    alone = updated(training(*given), latest)
+    together = AdversarialTraining([learner(*given)[0], learner(*given)[0]])
+    both = Batch(*(part.repeat_interleave(2, 0) for part in (latest.states, latest.actions, latest.source)))
+    for name, value in together.update(both, both).items():
+        torch.testing.assert_close(value, alone[name].expand(2), msg=name)
+    assert not torch.allclose(updated(training(given[1]), latest)["discriminator/loss"], alone["discriminator/loss"])

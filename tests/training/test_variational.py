@@ -207,3 +207,54 @@ def test_several_samples_of_a_group_are_predictions_of_as_many_copies(method: st
     )
     torch.testing.assert_close(shared, copies)
     assert torch.allclose(shared[:5], shared[5:10]) is deterministic
+
+
+def test_the_choice_of_dnri_may_be_held_for_a_trajectory_and_all_edges() -> None:
+    """With logits of 0 the noise alone chooses, so the types show what shares a draw."""
+
+    def chosen(*overrides: str) -> torch.Tensor:
+        made = learner("dnri", *overrides)
+        noise = made.model.draw_noise(2, 30, 3, torch.Generator().manual_seed(1))
+        return made.model.sample(torch.zeros(2, 30, 3, 3, 2), noise).argmax(dim=-1)  # (B, T, N, N)
+
+    held, shared = "variational.graph_resample=trajectory", "variational.graph_noise=shared"
+    for overrides, over_steps, over_edges in (
+        ((), False, False),
+        ((held,), True, False),
+        ((shared,), False, True),
+        ((held, shared), True, True),
+    ):
+        types = chosen(*overrides)
+        assert bool((types == types[:, :1]).all()) is over_steps
+        assert bool((types == types[:, :, :1, :1]).all()) is over_edges
+
+
+@pytest.mark.parametrize("noise", ["edge", "shared"])
+@pytest.mark.parametrize("method", ["nri", "dnri"])
+def test_a_held_choice_trains_and_predicts(method: str, noise: str) -> None:
+    made = learner(method, "variational.graph_resample=trajectory", f"variational.graph_noise={noise}")
+    made.run_epoch(0)
+    states = made.context.experts.states[:2]
+    for observed in (1, 3):
+        found = made.predictor.free_run(states[:, :observed], 5, torch.Generator().manual_seed(0), samples=2)
+        assert found.shape == (4, 6, 3, 4)
+        assert torch.isfinite(found).all()
+    assert made.predictor.one_step(states, torch.Generator()).shape == states[:, 1:].shape
+
+
+@pytest.mark.parametrize("decoder", ["messages", "recurrent"])
+def test_the_velocities_that_dnri_predicts_may_be_bounded_as_the_actors(decoder: str) -> None:
+    bounds = ("variational.action_step=0.1", "variational.action_bound=0.5")
+    steps = []
+    for overrides in ((), bounds):
+        made = learner("dnri", f"variational.decoder={decoder}", *overrides)
+        with torch.no_grad():
+            for parameter in made.model.decoder.parameters():
+                parameter += 0.5 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0))
+        states = made.predictor.free_run(made.context.experts.states[:4, :1], 20, torch.Generator().manual_seed(0))
+        velocities = states[..., 2:]
+        steps.append((float(velocities.diff(dim=1)[:, 5:].abs().max()), float(velocities[:, 8:].abs().max())))
+    assert steps[1][0] <= 0.1 + 1e-6
+    assert steps[1][1] <= 0.5 + 1e-6
+    assert steps[0][0] > 0.1  # negative control: without bounds it leaves them
+    assert steps[0][1] > 0.5

@@ -95,8 +95,8 @@ def explained_spec(
     """Return the spec that `build_spec` builds, and the place that the value of each dotted key comes from."""
     experiments = load_experiments(file)
     layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
-    layers += _override_layers(overrides, method, environment, source)
-    return _merge_layers(experiments, layers, method, environment, profile)
+    layers += override_layers(overrides, method, environment, source)
+    return merge_layers(experiments, layers, method, environment, profile)
 
 
 def ablation(name: str, environment: str | None = None, file: Path | None = None) -> Ablation:
@@ -146,8 +146,8 @@ def grid_specs(
     layers = experiments.layers(LAYERS, environment=environment, method=method, profile=profile)
     for found in named:
         layers += experiments.layers(ABLATION_LAYERS, ablation=found.name, profile=profile)
-    override_layers = _override_layers(overrides, method, environment, "--set")
-    overridden = {key for layer in override_layers for key in flatten(layer.values)}
+    given = override_layers(overrides, method, environment, "--set")
+    overridden = {key for layer in given for key in flatten(layer.values)}
     sides: dict[str, list[Layer]] = {}
     for axis in axes:
         key, side = _side(experiments, axis, {found.name: found for found in named}, method, environment)
@@ -162,7 +162,7 @@ def grid_specs(
         raise InputError(f"{len(combinations)} combinations of values are more than {MOST_SPECS}; give fewer values.")
     specs: dict[tuple[Any, ...], RunSpec] = {}
     for varied in combinations:
-        spec, _ = _merge_layers(experiments, [*layers, *override_layers, *varied], method, environment, profile)
+        spec, _ = merge_layers(experiments, [*layers, *given, *varied], method, environment, profile)
         specs[tuple(attrgetter(key)(spec) for key in sides)] = spec
     return Grid(tuple(sides), specs)
 
@@ -196,7 +196,7 @@ def display_value(value: Any) -> Any:
     return [int(part) if isinstance(part, float) and part.is_integer() else display_value(part) for part in value]
 
 
-def _merge_layers(
+def merge_layers(
     experiments: Experiments, layers: Iterable[Layer], method: str, environment: str, profile: str
 ) -> tuple[RunSpec, dict[str, str]]:
     """Return the spec of these layers, weakest first, and the source of each dotted key."""
@@ -275,7 +275,7 @@ def _read_ablation(experiments: Experiments, name: str, environment: str | None)
     return Ablation(name, entry["method"], environment, entry["key"], values)
 
 
-def _override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[Layer]:
+def override_layers(overrides: Sequence[str], method: str, environment: str, source: str) -> list[Layer]:
     """Return a layer for each "key.path=value"."""
     layers = []
     for text in overrides:

@@ -3,7 +3,8 @@
 A spec is merged from LAYERS, and later ones win. Each layer is a path in the file. For ssail on mocap in profile paper,
 `defaults` come first, then `environments.mocap`, `methods.ssail` and `environments.mocap.methods.ssail`; then
 `profiles.paper` and what it contains for the environment, for the method, and for the two together. The specs of an
-ablation add ABLATION_LAYERS. Overrides (--set) come last. A path that the file does not have is an empty layer.
+ablation add ABLATION_LAYERS, the arms of a control CONTROL_LAYERS. Overrides (--set) come last. A path that the file
+does not have is an empty layer.
 
 One file is in use: the one that $SSMAIL_EXPERIMENTS names, else the experiments.yaml of the current folder, else the
 one shipped with ssmail. That of the current folder is announced in the log, because nobody asked for it by name; for
@@ -14,7 +15,7 @@ import functools
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +35,7 @@ LAYERS = (
     "profiles.{profile}.methods.{method}.environments.{environment}",
 )
 ABLATION_LAYERS = ("ablations.{ablation}.settings", "profiles.{profile}.ablations.{ablation}")
+CONTROL_LAYERS = ("controls.{control}.arms.{arm}.settings", "profiles.{profile}.controls.{control}.{arm}")
 ENVIRONMENT_VARIABLE = "SSMAIL_EXPERIMENTS"
 FILE_NAME = "experiments.yaml"
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -60,6 +62,7 @@ class Experiments:
     profiles: Mappings
     ablations: Mappings
     figures: Mappings
+    controls: Mappings = field(default_factory=dict)  # files of earlier versions have none
 
     def entry(self, kind: str, name: str) -> Mapping[str, Any]:
         """Return the entry `name` of the section for `kind` ("method"). Raises InputError if there is none."""
@@ -69,12 +72,14 @@ class Experiments:
         return _mapping(entries[name], f"{kind} '{name}'")
 
     def layers(self, templates: Sequence[str], **names: str) -> list[Layer]:
-        """Return the layers of LAYERS or ABLATION_LAYERS, filled in with the names of a method, environment, etc.
+        """Return the layers of LAYERS, ABLATION_LAYERS or CONTROL_LAYERS, filled in with the names of a method, etc.
 
-        Raises InputError for an unknown name, in `names` or within an environment or a profile.
+        Raises InputError for an unknown name, in `names` or within an environment or a profile. Who names an arm has
+        found it in its control already (`ssmail.config.controls`).
         """
         for kind, name in names.items():
-            self.entry(kind, name)
+            if kind != "arm":
+                self.entry(kind, name)
         return [self._layer(template, names) for template in templates]
 
     def _layer(self, template: str, names: Mapping[str, str]) -> Layer:
@@ -110,14 +115,14 @@ def load_experiments(file: Path | None = None) -> Experiments:
 @functools.lru_cache(maxsize=4)
 def _parsed(path: Path, source: bytes) -> Experiments:
     content = strict_yaml.parse_bytes(source, path)
-    sections = [field.name for field in fields(Experiments) if field.name != "path"]
+    sections = {part.name: part.default_factory is not MISSING for part in fields(Experiments) if part.name != "path"}
     if not isinstance(content, dict):
         raise InputError(f"{path} contains no mapping; it needs the sections {', '.join(sections)}.")
     for name in content:
         if name not in sections:
             raise InputError(f"unknown section '{shortened(name, 60)}' in {path}; {suggestion(name, sections)}")
-    for name in sections:
-        if not isinstance(content.get(name), dict):
+    for name, is_optional in sections.items():
+        if not isinstance(content.get(name, {} if is_optional else None), dict):
             raise InputError(f"section '{name}' of {path} is missing or no mapping; compare with the shipped one.")
     return Experiments(path=path, **content)
 
@@ -151,7 +156,7 @@ def _announce(path: Path) -> None:
 
 def _check_names_no_code(experiments: Experiments) -> None:
     """Raise InputError if any text of the file has the form module:function."""
-    for text in _texts([getattr(experiments, field.name) for field in fields(experiments) if field.name != "path"]):
+    for text in _texts([getattr(experiments, part.name) for part in fields(experiments) if part.name != "path"]):
         if FUNCTION.fullmatch(text):
             raise InputError(
                 f"{experiments.path} names Python code, {shortened(text, 60)}, which a file that was only found in the "
@@ -180,7 +185,8 @@ def merge(weak: Mapping[str, Any], strong: Mapping[str, Any]) -> dict[str, Any]:
 def _nested_sections(template: str) -> list[str]:
     """Return the sections inside a layer that make up other layers, such as `methods` in an environment."""
     prefix = f"{template}."
-    inside = [path.removeprefix(prefix) for path in (*LAYERS, *ABLATION_LAYERS) if path.startswith(prefix)]
+    every = (*LAYERS, *ABLATION_LAYERS, *CONTROL_LAYERS)
+    inside = [path.removeprefix(prefix) for path in every if path.startswith(prefix)]
     return list(dict.fromkeys(path.partition(".")[0] for path in inside))
 
 

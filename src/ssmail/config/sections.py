@@ -51,6 +51,8 @@ class ModelSpec(Frozen):
     discriminator_waves: Waves
     """Frequencies of the sines and cosines of positions that the discriminator reads beside the positions: without them
     a small network is slow to tell places apart that are close to each other."""
+    discriminator_velocities: bool
+    """The discriminator reads velocities, of states and actions; false: positions alone, beside time and agent."""
     edge_types: Count
     """Number of edge types, the latent classes of an ordered pair of agents."""
     first_type_is_none: bool
@@ -118,6 +120,8 @@ class AdversarialSpec(Frozen):
     reward."""
     input_noise_start: Start
     """When input_noise begins to fall."""
+    reward: Literal["own", "probability"]
+    """The reward made of the discriminator's output: the method's own; or, of gail, the probability of "expert"."""
     reward_scale: Positive
     """Factor of the reward."""
     reward_limit: Positive | None
@@ -135,6 +139,8 @@ class SelfSupervisionSpec(Frozen):
     """Which expert trajectory a generated one is mixed with in the discriminator's batches."""
     actor_pairing: Pairing
     """Which expert trajectory a generated one is mixed with in the actor-critic's batches."""
+    discriminator_weight: NonNegative
+    """Weight of the term of tau_alpha in the discriminator's loss; 0: the discriminator never sees tau_alpha."""
     actor_share: Fraction
     """Share of tau_alpha in an actor-critic batch; the rest is tau_G."""
 
@@ -223,6 +229,14 @@ class VariationalSpec(Frozen):
     """Number of edge types, the latent classes of an ordered pair of agents."""
     first_type_is_none: bool
     """Edges of the first type carry no messages."""
+    graph_noise: Literal["edge", "shared"]
+    """As model.graph_noise."""
+    graph_resample: Literal["step", "trajectory"]
+    """dnri: how often the noise of the edge types is resampled, as model.graph_resample; nri has one graph."""
+    action_step: Annotated[Positive, Unit("scaled units")] | None
+    """Largest change of velocity by a prediction, as model.action_step of the actor; null: no bound."""
+    action_bound: Annotated[Positive, Unit("scaled units")] | None
+    """As model.action_bound, where there is an action_step; null: no bound."""
     batch_norm: bool
     """The encoder has batch normalization."""
     encoder_window: Steps | None

@@ -6,6 +6,7 @@ Its sections are in `ssmail.config.sections`. A spec defines everything about a 
 import difflib
 import hashlib
 import json
+import math
 import re
 from collections.abc import Iterable, Mapping
 from itertools import chain
@@ -49,14 +50,19 @@ ADDED_KEYS: tuple[tuple[str, str, Any], ...] = (
     ("model", "standardize", False),
     ("model", "discriminator_hidden", None),
     ("model", "discriminator_waves", []),
+    ("model", "discriminator_velocities", True),
+    ("self_supervision", "discriminator_weight", 1.0),
     ("sac", "encoder_steps", None),
+    ("adversarial", "reward", "own"),
     ("adversarial", "input_noise_final", 1.0),
     ("adversarial", "input_noise_start", 0.0),
     ("sac", "expansion_steps", 0),
     ("sac", "expansion_start", 0.0),
     ("sac", "finite_horizon", False),
     ("sac", "average", None),
-    ("variational", "encoder_window", None),
+    ("variational", "graph_noise", "edge"),
+    ("variational", "graph_resample", "step"),
+    *(("variational", key, None) for key in ("encoder_window", "action_step", "action_bound")),
     *(("variational", key, False) for key in ("root_relative", "agent_input", "standardize")),
     *((section, "centre_relative", False) for section in ("model", "variational")),
     *(("forecast", key, None) for key in ("miss_distance", "collision_distance")),
@@ -97,6 +103,12 @@ class RunSpec(Frozen):
                 raise ValueError(f"environment {self.environment} {'needs' if needed else 'has no'} data.{name}")
         if self.environment not in GENERATED_ENVIRONMENTS and self.data.path is None:
             raise ValueError(f"environment {self.environment} needs a data file; set data.path")
+        if self.adversarial and self.adversarial.reward == "probability" and self.method != "gail":
+            raise ValueError(f"adversarial.reward probability is for gail alone, not {self.method}; leave it out")
+        if self.variational and self.variational.action_bound and not self.variational.action_step:
+            raise ValueError("variational.action_bound bounds nothing without variational.action_step; set both")
+        if self.variational and (self.variational.action_bound or math.inf) < (self.variational.action_step or 0):
+            raise ValueError("variational.action_bound is less than variational.action_step; raise it")
         return self
 
     @property

@@ -207,17 +207,18 @@ def _by_group(memory: Memory, like: Tensor) -> tuple[Tensor, Tensor]:
 def _variational(
     model: VariationalModel, run: TrainedRun, state: Mapping[str, Tensor], batch: int, agents: int
 ) -> dict[str, Program]:
-    edge_noise = _noise(GraphNoise("edge", "step"), batch, agents, model.spec.edge_types)
+    edge_noise = _noise(model.graph_noise, batch, agents, model.spec.edge_types)
     memory = torch.zeros(batch, agents, model.spec.decoder_hidden)
     if isinstance(model.encoder, DynamicEncoder):
         edges = torch.zeros(batch, agents * (agents - 1), model.spec.memory)
         inputs = {**state, "hidden": edges, "cell": edges, "memory": memory, "graph_noise": edge_noise}
         outputs = ("next_positions", "next_velocities", "next_hidden", "next_cell", "next_memory")
-        meanings = _STATE | {"graph_noise": f"{GUMBEL}; drawn anew at every step"}
+        drawn = "once per trajectory" if model.graph_noise.resample == "trajectory" else "anew at every step"
+        meanings = _STATE | {"graph_noise": f"{GUMBEL}; drawn {drawn}"}
         return {"step": Program(DynamicStep(model, run.scaling), inputs, outputs, meanings)}
     frames = run.observed or 1
     seen = {name: value.unsqueeze(1).expand(-1, frames, -1, -1).contiguous() for name, value in state.items()}
-    step = {**state, "graph": torch.zeros_like(edge_noise), "memory": memory}
+    step = {**state, "graph": torch.zeros(batch, agents, agents, model.spec.edge_types), "memory": memory}
     graph_meanings = {
         "positions": f"the {frames} observed frames with velocities, raw units",
         "velocities": "theirs: positions less those of the frame before, raw units",

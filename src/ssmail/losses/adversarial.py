@@ -12,19 +12,25 @@ from torch import Tensor, nn
 from ssmail.losses import PER_SEED, Terms
 
 
-def ssail_loss(generated: Tensor, expert: Tensor, mixed: Tensor, labels: Tensor) -> tuple[Tensor, Terms]:
+def ssail_loss(
+    generated: Tensor, expert: Tensor, mixed: Tensor | None = None, labels: Tensor | None = None, weight: float = 1.0
+) -> tuple[Tensor, Terms]:
     """Eq. 3: (0 - D(tau_G))^2 + (1 - D(tau_E))^2 + (label(alpha) - D(tau_alpha))^2, each averaged over B, T and N.
 
     labels: (B,), or (S, B), targets for the mixed trajectories: alpha itself in the paper, or that of A.2
-    (`ssmail.losses.labels`).
+    (`ssmail.losses.labels`). weight: of the last term, 1 in the paper. Without `mixed` there is no such term, and the
+    loss is that of least-squares GAN (Mao et al. 2017).
     """
-    target = labels.view(*labels.shape, *[1] * (mixed.dim() - labels.dim()))
     terms = {
         "generated": generated.square().mean(dim=PER_SEED),
         "expert": (1 - expert).square().mean(dim=PER_SEED),
-        "self_supervised": (target - mixed).square().mean(dim=PER_SEED),
     }
-    return terms["generated"] + terms["expert"] + terms["self_supervised"], terms
+    loss = terms["generated"] + terms["expert"]
+    if mixed is None or labels is None:
+        return loss, terms
+    target = labels.view(*labels.shape, *[1] * (mixed.dim() - labels.dim()))
+    terms["self_supervised"] = weight * (target - mixed).square().mean(dim=PER_SEED)
+    return loss + terms["self_supervised"], terms
 
 
 def ssail_reward(output: Tensor) -> Tensor:
@@ -51,6 +57,11 @@ def gail_reward(logit: Tensor) -> Tensor:
     1 - sigmoid(logit), so the reward to maximize is -log(1 - sigmoid(logit)). softplus does not overflow.
     """
     return nn.functional.softplus(logit)
+
+
+def gail_probability(logit: Tensor) -> Tensor:
+    """sigmoid(logit), the probability of "expert": a reward that hardly rises where the discriminator is sure."""
+    return torch.sigmoid(logit)
 
 
 def wail_loss(generated: Tensor, expert: Tensor) -> tuple[Tensor, Terms]:

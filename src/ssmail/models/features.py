@@ -89,6 +89,15 @@ class Features:
         """Return the number of features F of an agent with `state_size` state features."""
         return state_size * (1 + self.start) + self.time + self.agents
 
+    def without_velocities(self, state_size: int) -> Tensor:
+        """Return a mask (F,) of the features: 0 for the velocities of the state and of the first state, else 1."""
+        mask, axes = torch.ones(self.size(state_size)), state_size // 2
+        mask[axes:state_size] = 0
+        if self.start:
+            first = state_size + self.time
+            mask[first + axes : first + state_size] = 0
+        return mask
+
     def __call__(self, states: Tensor, start: Tensor, first_step: int = 0) -> Tensor:
         """Map states (..., T, N, D) from step `first_step` on, and start (..., N, D), to features (..., T, N, F)."""
         steps = torch.arange(first_step, first_step + states.shape[-3], dtype=states.dtype, device=states.device)

@@ -77,14 +77,34 @@ class ActionBounds:
         they decide, axis by axis: `step` is SPARE times the change of velocity that the share MOST of them does not
         exceed, and the bound SPARE times the distance of velocities from the mean (or 0), and a step.
         """
-        if normalization is None:
-            mean, unit = torch.tensor(0.0), torch.tensor(1.0)
-        else:
-            mean, unit = normalization.velocity.mean, normalization.velocity.std
+        mean, unit = _mean_and_unit(normalization)
         step, bound = spec.action_step, spec.action_bound
         reach = step if step is not None else SPARE * _most([part.diff(dim=1) / unit for part in velocities])
         margin = bound if bound is not None else SPARE * _most([(part - mean) / unit for part in velocities]) + reach
-        return cls(reach * unit, mean - margin * unit, mean + margin * unit)
+        return cls.within(reach, margin, normalization)
+
+    @classmethod
+    def within(
+        cls, step: float | Tensor, bound: float | Tensor, normalization: Normalization | None = None
+    ) -> "ActionBounds":
+        """Return the bounds for `step` and `bound` in the units of `of`; an infinite `bound` bounds nothing."""
+        mean, unit = _mean_and_unit(normalization)
+        return cls(step * unit, mean - bound * unit, mean + bound * unit)
+
+    def limit(self, action: Tensor, velocity: Tensor) -> Tensor:
+        """Bring actions (..., N, A) softly within the bounds, given the current velocities (..., N, A).
+
+        c + d tanh((a - c) / d), with the actor's centre c (`ssmail.models.policy`): near the current velocity a itself.
+        """
+        centre = torch.maximum(torch.minimum(velocity, self.high - self.step), self.low + self.step)
+        return centre + self.step * torch.tanh((action - centre) / self.step)
+
+
+def _mean_and_unit(normalization: Normalization | None) -> tuple[Tensor, Tensor]:
+    """Return the mean velocity and the unit of velocities that networks read."""
+    if normalization is None:
+        return torch.tensor(0.0), torch.tensor(1.0)
+    return normalization.velocity.mean, normalization.velocity.std
 
 
 def _most(parts: Sequence[Tensor]) -> Tensor:

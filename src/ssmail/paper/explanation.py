@@ -12,7 +12,15 @@ from ssmail.errors import InputError, stored_values
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.csv_comparison import RELATIVE, first_difference
 from ssmail.paper.results import FIGURES
-from ssmail.plots import ablation, forecast_curves, forecast_trajectories, provenance, training_curves, varied_runs
+from ssmail.plots import (
+    ablation,
+    control,
+    forecast_curves,
+    forecast_trajectories,
+    provenance,
+    training_curves,
+    varied_runs,
+)
 from ssmail.plots.data_sets import data_sets
 from ssmail.plots.provenance import LARGEST, Provenance, RunSource
 from ssmail.plots.saving import csv_text, digest
@@ -154,6 +162,9 @@ def _collect_again(source: Provenance, store: Store) -> pd.DataFrame:
         with stored_values("its runs"):
             selection = varied_runs.select(store, runs, keys, named=True)
             return ablation.collect(store, selection, keys, names, statistic).table()
+    if name == control.NAME:
+        with stored_values("its runs"):
+            return control.collect_again(store, source, statistic).table()
     if name in (forecast_curves.NAME, forecast_trajectories.NAME):
         with stored_values("its runs"):
             return _collect_forecasts(source, store, statistic)

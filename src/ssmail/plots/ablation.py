@@ -140,7 +140,7 @@ def collect(
     metrics = tuple(dict.fromkeys(metrics))
     return AblationRecord(
         keys=tuple(keys),
-        panels=tuple(_panel(store, selection.groups, metric, statistic) for metric in metrics),
+        panels=tuple(collect_panel(store, selection.groups, metric, statistic) for metric in metrics),
         statistic=statistic,
         settings=settings_of(selection.runs),
         provenance=Provenance.of(
@@ -153,7 +153,8 @@ def collect(
     )
 
 
-def _panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statistic) -> Panel:
+def collect_panel(store: Store, groups: Sequence[Group], metric: str, statistic: Statistic) -> Panel:
+    """Collect a metric of the runs of each group. Raises InputError if none of them has it."""
     runs = [run for group in groups for run in group.runs]
     known, _ = known_values(store, runs, [metric])
     if not known:
@@ -177,10 +178,12 @@ def draw(record: AblationRecord) -> Figure:
     """Draw a panel for each metric, one below the other, over evenly spaced values; the legend stands above them."""
     labels = [setting(value) for value in record.values(-1)] if len(record.keys) > 1 else [""]
     strokes = style.strokes(labels) if len(labels) > 1 else {labels[0]: style.METHODS["ssail"]}
-    ticks = _ticks([style.literal(setting(value)) for value in record.values(0)])
-    slanted = max(map(_widest, ticks)) > FLAT // len(ticks) + 2
+    values = [style.literal(setting(value)) for value in record.values(0)]
+    ticks = _ticks(values)
+    slanted = max(map(_widest, ticks)) > FLAT // len(ticks) + 2 or max(tick.count("\n") for tick in ticks) > 1
+    ticks = values if slanted else ticks
     with style.sheet():
-        height = 0.7 + 0.12 * (len(labels) // 2) + 1.7 * len(record.panels) + 0.4 * slanted
+        height = 0.7 + 0.12 * (len(labels) // 2) + 1.7 * len(record.panels) + 0.03 * slanted * max(map(len, ticks))
         figure = style.new_figure(height=height)
         grid = figure.subplots(len(record.panels), 1, sharex=True, squeeze=False)[:, 0]
         handles: dict[str, Line2D] = {}

@@ -17,6 +17,7 @@ from ssmail.config.value_types import Pairing
 from ssmail.losses import Terms
 from ssmail.losses.adversarial import (
     gail_loss,
+    gail_probability,
     gail_reward,
     gradient_penalty,
     ssail_loss,
@@ -45,12 +46,19 @@ from ssmail.training.stacking import StackedAdam, fixed, stacked_modules
 class AdversarialObjective:
     """The two functions that define a method.
 
-    loss: the discriminator's loss from its outputs on tau_G and tau_E (and, for ssail, on tau_alpha and its labels).
+    loss: the discriminator's loss from its outputs on tau_G and tau_E (and, for ssail, on tau_alpha, its labels, and
+    the weight of that term).
     reward: the actor-critic's reward from the discriminator's output.
     """
 
     loss: Callable[..., tuple[Tensor, Terms]]
     reward: Callable[[Tensor], Tensor]
+
+    @classmethod
+    def of(cls, method: str, spec: AdversarialSpec) -> "AdversarialObjective":
+        """Return the objective of a method, with the reward that the spec asks for."""
+        own = OBJECTIVES[method]
+        return own if spec.reward == "own" else replace(own, reward=gail_probability)
 
 
 OBJECTIVES = {
@@ -66,8 +74,8 @@ class AdversarialLearner:
     def __init__(self, context: LearnerContext) -> None:
         spec = context.spec
         model, sac = required(spec.model), required(spec.sac)
-        self.context, self.objective = context, OBJECTIVES[spec.method]
         self.adversarial, self.training = required(spec.adversarial), required(spec.training)
+        self.context, self.objective = context, AdversarialObjective.of(spec.method, self.adversarial)
         self.generators = context.generators
         self.label = None
         if spec.self_supervision:
@@ -80,7 +88,9 @@ class AdversarialLearner:
             critic = TwinCritic(inputs, model).to(context.device)
             waves = Waves(context.experts.actions.shape[-1], model.discriminator_waves)
             hidden = model.discriminator_hidden or model.hidden
-            self.discriminator = Discriminator(inputs, hidden, waves).to(context.device)
+            state_size = context.experts.states.shape[-1]
+            seen = None if model.discriminator_velocities else self.features.without_velocities(state_size)
+            self.discriminator = Discriminator(inputs, hidden, waves, seen).to(context.device)
         self.actor_critic = ActorCritic(sac, self.predictor, critic, self.generators)
         if self.actor_critic.averaged is not None:
             self.predictor = replace(self.predictor, model=self.actor_critic.averaged)
@@ -258,11 +268,11 @@ class AdversarialTraining:
             parts.append(replay.draw(past, data))
         batches = [Batch.concatenate(parts), self.experts.draw(b, data)]
         # tau_alpha and its labels (self-supervision).
-        labels: tuple[Tensor, ...] = ()
-        if self.supervision and self.label:
+        targets: tuple[Tensor | float, ...] = ()
+        if self.supervision and self.label and self.supervision.discriminator_weight:
             mixed, alpha = self._mixed(batches[0], self.supervision, self.supervision.pairing)
             batches.append(mixed)
-            labels = (torch.stack([self.label(part) for part in alpha]),)
+            targets = torch.stack([self.label(part) for part in alpha]), self.supervision.discriminator_weight
         # One pass of D over all parts at the same random time steps; its outputs are then split again (Eq. 3).
         everything = Batch.concatenate(batches)
         chosen = self._pick_steps(everything.actions.shape[2])
@@ -271,7 +281,7 @@ class AdversarialTraining:
         x = self._add_input_noise(x, states.shape[-1])
         actions = self._add_input_noise(self.features.normalize_actions(at_steps(everything.actions, chosen)))
         outputs = self.discriminator(x, actions).chunk(len(batches), dim=1)
-        loss, terms = self.objective.loss(*outputs, *labels)
+        loss, terms = self.objective.loss(*outputs, *targets)
         # wail bounds D's slope by a gradient penalty, or by clipping its weights.
         if self.wasserstein and self.wasserstein.constraint == "penalty":
             (x_g, x_e), (a_g, a_e) = x.chunk(2, dim=1), actions.chunk(2, dim=1)

@@ -3,6 +3,7 @@
 Kipf et al. 2018 (nri); Graber and Schwing 2020 (dnri).
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from ssmail.losses.likelihood import fixed_prior, variational_loss
 from ssmail.models.decoders import make_decoder
 from ssmail.models.features import Features
 from ssmail.models.graph_encoder import GraphNoise, Memory, sample_graph
+from ssmail.models.normalization import ActionBounds
 from ssmail.models.variational_encoder import DynamicEncoder, StaticEncoder, WindowEncoder
 from ssmail.training.batches import Batch
 from ssmail.training.cloning import SupervisedLearner
@@ -48,7 +50,11 @@ class VariationalModel(nn.Module):
             self.encoder = StaticEncoder(inputs, spec)
         self.decoder = make_decoder(inputs, action_size, spec)
         self.register_buffer("fixed_prior", fixed_prior(spec.edge_types, spec.none_prior), persistent=False)
-        self.graph_noise = GraphNoise("edge", "step" if dynamic else "trajectory")
+        self.graph_noise = GraphNoise(spec.graph_noise, spec.graph_resample if dynamic else "trajectory")
+        self.bounds = None
+        if spec.action_step is not None:
+            bound = math.inf if spec.action_bound is None else spec.action_bound
+            self.bounds = ActionBounds.within(spec.action_step, bound, features.normalization)
 
     def posterior(self, states: Tensor) -> tuple[Tensor, Tensor]:
         """Return the posterior's logits (B, T or 1, N, N, K) for states (B, T, N, D), and the prior's."""
@@ -82,10 +88,12 @@ class VariationalModel(nn.Module):
     def decode(self, states: Tensor, graphs: Tensor, memory: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
         """Return actions (B, T, N, A) after states (B, T, N, D), and the decoder's memory.
 
-        graphs: (B, T or 1, N, N, K). The decoder predicts a residual on the velocity as it reads it.
+        graphs: (B, T or 1, N, N, K). The decoder predicts a residual on the velocity as it reads it; the action is
+        within the bounds of variational.action_step, if there are any.
         """
         output, memory = self.decoder(self.read(states), graphs, memory)
-        return self.features.denormalize_actions(output), memory
+        action = self.features.denormalize_actions(output)
+        return action if self.bounds is None else self.bounds.limit(action, states[..., action.shape[-1] :]), memory
 
     def sample(self, logits: Tensor, noise: Tensor) -> Tensor:
         """Sample one-hot graphs by the straight-through Gumbel softmax."""
@@ -150,7 +158,8 @@ class _GraphSampler:
 
     def _next(self, logits: Tensor) -> Tensor:
         first, self.step = self.step, self.step + logits.shape[1]
-        return self.model.sample(logits, self.gumbel[:, first : self.step])
+        held = self.gumbel.shape[1] == 1  # one draw for the whole trajectory
+        return self.model.sample(logits, self.gumbel if held else self.gumbel[:, first : self.step])
 
     def _of_samples(self, of_groups: Tensor, axis: int = 0) -> Tensor:
         return of_groups.repeat_interleave(self.samples, axis) if self.samples > 1 else of_groups
