@@ -1,0 +1,100 @@
+"""Tasks of a Ray cluster, through Ray's own API."""
+
+import logging
+import os
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ssmail.errors import InputError, masked, missing_package, shortened, unknown_name
+from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, whole, wrong_setting
+
+try:
+    import ray
+except ImportError as error:
+    raise missing_package(error, "ray") from None
+
+RETRIES = 10
+"""How often a task is begun again on another node because its node died, by default."""
+SETTINGS = ("address", "cpus", "gpus", "memory", "retries")
+_UNITS = {"": 1, "K": 2**10, "M": 2**20, "G": 2**30}
+
+
+class RayLauncher:
+    """Submits tasks with these settings to a running cluster."""
+
+    def __init__(self, settings: Mapping[str, str], processes: int) -> None:
+        for key in settings:
+            if key not in SETTINGS:
+                raise unknown_name("setting of --launcher ray", key, SETTINGS)
+        options: dict[str, Any] = {
+            "num_cpus": _amount(settings, "cpus", processes),
+            "num_gpus": _amount(settings, "gpus", 0),
+            "max_retries": whole(settings, "retries", RETRIES, 0),
+        }
+        if "memory" in settings:
+            options["memory"] = _bytes(settings["memory"])
+        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+        address = settings.get("address", "auto")
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise InputError(
+                f"--launcher ray cannot reach a Ray cluster at address={shortened(address, 60)} ("
+                f"{shortened(_first_line(error), 80)}); start one with `ray start --head`, or give another "
+                "--launcher-set address="
+            ) from None
+        self._compute = ray.remote(**options)(compute)
+        self._tasks: dict[Any, str] = {}  # names by reference
+        self._submitted = 0
+
+    def submit(self, jobs: Sequence[str]) -> list[str]:
+        """Submit a task for each job."""
+        names = []
+        for job in jobs:
+            names.append(f"task {self._submitted}")
+            self._tasks[self._compute.remote(job)] = names[-1]
+            self._submitted += 1
+        return names
+
+    def poll(self) -> list[Ended]:
+        """Return the results of the tasks that are ready."""
+        waiting = list(self._tasks)
+        ready, _ = ray.wait(waiting, num_returns=len(waiting), timeout=0) if waiting else ([], [])
+        return [self._result(task, self._tasks.pop(task)) for task in ready]
+
+    def cancel(self) -> None:
+        """Cancel the tasks: Ray interrupts those that run, as Ctrl-C does."""
+        for task in self._tasks:
+            ray.cancel(task)
+
+    def close(self) -> None:
+        """Leave the cluster, which ends the tasks that are left."""
+        ray.shutdown()
+
+    def _result(self, task: Any, name: str) -> Ended:
+        try:
+            return Ended(name, ray.get(task))
+        except ray.exceptions.TaskCancelledError:
+            return Ended(name, None, INTERRUPTED, "its Ray task was cancelled")
+        except ray.exceptions.RayError as error:
+            return Ended(name, None, FAILED, f"its Ray task ended: {type(error).__name__}: {_first_line(error)}")
+
+
+def _first_line(error: Exception) -> str:
+    return masked(next(iter(str(error).strip().splitlines()), ""))
+
+
+def _amount(settings: Mapping[str, str], key: str, default: int) -> float:
+    """Return a number of CPUs or GPUs, which may be a part of one."""
+    text = settings.get(key, str(default))
+    if not re.fullmatch(r"\d{1,4}(\.\d{1,4})?", text, re.ASCII):
+        raise wrong_setting(key, text, "a number such as 1 or 0.5")
+    return float(text)
+
+
+def _bytes(text: str) -> int:
+    found = re.fullmatch(r"(\d{1,12})([KMG]?)B?", text, re.ASCII)
+    if not found:
+        raise wrong_setting("memory", text, "a number of bytes such as 4G")
+    return int(found[1]) * _UNITS[found[2]]
