@@ -60,6 +60,9 @@ class Launch:
                 f"--launcher {launcher} is for --resume auto or require, not never, because a job that is requeued "
                 "resumes its runs."
             )
+        from ssmail.execution.launched_sweep import check_settings
+
+        check_settings(launcher, settings)
         return cls(jobs, resume, device, launcher, settings)  # the device is that of a node
 
     def compute(self, store: "Store", cells: "Sequence[Cell]", report: Report) -> "list[Event]":

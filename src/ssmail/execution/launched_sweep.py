@@ -30,12 +30,26 @@ class Grouping(NamedTuple):
 SINGLE = Grouping()
 
 
+def check_settings(name: LauncherName, settings: Mapping[str, str]) -> None:
+    """Raise InputError for a wrong setting of the launcher, or without its package."""
+    whole(settings, CELLS, 1)
+    own = {key: value for key, value in settings.items() if key != CELLS}
+    if name is LauncherName.SLURM:
+        from ssmail.execution.slurm_launcher import parameters
+
+        parameters(own)
+    else:
+        from ssmail.execution.ray_launcher import options
+
+        options(own)
+
+
 def open_launcher(
     name: LauncherName, settings: Mapping[str, str], store: Store, jobs: int
 ) -> tuple[Launcher, Grouping]:
     """Return the launcher with these settings, and how to group cells for it.
 
-    Raises InputError for a wrong setting, without its package, or without its cluster.
+    Raises InputError as `check_settings` does, and without its cluster.
     """
     cells = whole(settings, CELLS, 1)
     grouping = Grouping(cells, min(jobs, cells))
@@ -225,10 +239,10 @@ class _Sweep:
             if event.bad_input and not self._has_started:
                 raise InputError(event.message)
         for event in events:
-            if event.cell in self._seen and event.run_id == self._seen[event.cell].run_id:
-                self._report_epochs(event.cell)
-            if event.cell not in self.results:
-                self.emit(event)
+            row = self._store.find_cell(event.cell.spec.hash(), event.cell.seed)
+            if row is not None and row.id == event.run_id and event.kind != "skipped":
+                self._follow(event.cell, row)  # it may have done much since the last look
+            self.emit(event)
         for cell in cells:
             if cell not in self.results:
                 self._left[cell] = _Left(ended.kind, ended.message)

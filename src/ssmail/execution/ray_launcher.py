@@ -24,16 +24,7 @@ class RayLauncher:
     """Submits tasks with these settings to a running cluster."""
 
     def __init__(self, settings: Mapping[str, str], processes: int) -> None:
-        for key in settings:
-            if key not in SETTINGS:
-                raise unknown_name("setting of --launcher ray", key, SETTINGS)
-        options: dict[str, Any] = {
-            "num_cpus": _amount(settings, "cpus", processes),
-            "num_gpus": _amount(settings, "gpus", 0),
-            "max_retries": whole(settings, "retries", RETRIES, 0),
-        }
-        if "memory" in settings:
-            options["memory"] = _bytes(settings["memory"])
+        given = options(settings, processes)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         address = settings.get("address", "auto")
         try:
@@ -44,7 +35,7 @@ class RayLauncher:
                 f"{shortened(_first_line(error), 80)}); start one with `ray start --head`, or give another "
                 "--launcher-set address="
             ) from None
-        self._compute = ray.remote(**options)(compute)
+        self._compute = ray.remote(**given)(compute)
         self._tasks: dict[Any, str] = {}  # names by reference
         self._submitted = 0
 
@@ -79,6 +70,21 @@ class RayLauncher:
             return Ended(name, None, INTERRUPTED, "its Ray task was cancelled")
         except ray.exceptions.RayError as error:
             return Ended(name, None, FAILED, f"its Ray task ended: {type(error).__name__}: {_first_line(error)}")
+
+
+def options(settings: Mapping[str, str], processes: int = 1) -> dict[str, Any]:
+    """Return the settings as options of Ray's tasks. Raises InputError for a wrong setting."""
+    for key in settings:
+        if key not in SETTINGS:
+            raise unknown_name("setting of --launcher ray", key, SETTINGS)
+    found: dict[str, Any] = {
+        "num_cpus": _amount(settings, "cpus", processes),
+        "num_gpus": _amount(settings, "gpus", 0),
+        "max_retries": whole(settings, "retries", RETRIES, 0),
+    }
+    if "memory" in settings:
+        found["memory"] = _bytes(settings["memory"])
+    return found
 
 
 def _first_line(error: Exception) -> str:

@@ -4,9 +4,11 @@ Only the submission and the requeueing are submitit's. Whether a job has ended i
 has; submitit asks `sacct`, which needs an accounting database.
 """
 
+import io
 import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +63,7 @@ class SlurmLauncher:
     """Submits arrays of jobs with these settings; `folder` is for their logs, and has to be shared by all nodes."""
 
     def __init__(self, settings: Mapping[str, str], folder: Path, processes: int) -> None:
-        parameters, requeues = _parameters(settings, processes)
+        given, requeues = parameters(settings, processes)
         folder.mkdir(parents=True, exist_ok=True)
         folder.chmod(0o700)  # the jobs contain the URL of the database
         try:
@@ -70,7 +72,7 @@ class SlurmLauncher:
             raise InputError(
                 "--launcher slurm finds no `srun` on this machine; start it on a login node of the cluster"
             ) from None
-        self._executor.update_parameters(**parameters)
+        self._executor.update_parameters(**given)
         self._jobs: dict[str, Any] = {}
         self._missing_since: dict[str, float] = {}
 
@@ -79,7 +81,8 @@ class SlurmLauncher:
         names = []
         for first in range(0, len(jobs), _LARGEST_ARRAY):
             try:
-                array = self._executor.map_array(Resumable(), jobs[first : first + _LARGEST_ARRAY])
+                with redirect_stderr(io.StringIO()):  # of sbatch, which is in the error too
+                    array = self._executor.map_array(Resumable(), jobs[first : first + _LARGEST_ARRAY])
             except (FailedJobError, FailedSubmissionError, OSError) as error:
                 raise InputError(f"SLURM refused the jobs: {shortened(_last_line(str(error)), 200)}") from error
             self._jobs |= {job.job_id: job for job in array}
@@ -138,7 +141,7 @@ class SlurmLauncher:
         return Ended(name, None, kind, f"its SLURM job {name} {how}{f': {reason}' if reason else ''}")
 
 
-def _parameters(settings: Mapping[str, str], processes: int) -> tuple[dict[str, Any], int]:
+def parameters(settings: Mapping[str, str], processes: int = 1) -> tuple[dict[str, Any], int]:
     """Return the settings as submitit's parameters, and how often to requeue. Raises InputError for a wrong setting."""
     given: dict[str, Any] = {}
     for key, text in settings.items():
