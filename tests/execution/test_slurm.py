@@ -1,0 +1,124 @@
+"""Sweeps as jobs of a real SLURM on this machine: the commands of docs/cluster.md."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssmail.store import Store
+from tests.cli.command_line import Outcome
+from tests.execution.recorded import recorded
+from tests.execution.slurm_cluster import Cluster
+
+pytestmark = pytest.mark.slow
+SWEEP = ("train", "bc", "ssail", "--profile", "smoke", "--seeds", "0-1")
+LONG = ("train", "bc", "--profile", "smoke", "--seeds", "0-2", "--set", "training.epochs=120")
+SLURM = ("--launcher", "slurm", "--launcher-set", "partition=main,time=120")
+Numbers = dict[tuple[str, int], Any]
+
+
+@pytest.fixture(scope="module")
+def slurm() -> Iterator[Cluster]:
+    pytest.importorskip("submitit", reason="submitit, of the extra slurm, is not installed")
+    cluster = Cluster()
+    yield cluster
+    cluster.close()
+
+
+class FrontEnd:
+    """A command in a process of its own, whose folder is that of its database."""
+
+    def __init__(self, folder: Path, *words: str, **environment: str) -> None:
+        folder.mkdir(exist_ok=True)
+        self._log = folder / "stderr.log"
+        with self._log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "ssmail_cli", *words, "--device", "cpu"],
+                env={**os.environ, "SSMAIL_STALE_SECONDS": "10", **environment},
+                cwd=folder,
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+            )
+
+    def wait_for(self, text: str) -> None:
+        while text not in self._log.read_text():
+            assert self.process.poll() is None, f"ended before it said {text!r}: {self._log.read_text()}"
+
+    def end(self) -> Outcome:
+        said, _ = self.process.communicate(timeout=400)
+        return Outcome(self.process.returncode, said, self._log.read_text())
+
+
+def numbers(folder: Path) -> dict[tuple[str, int], Any]:
+    store = Store.open(folder / "results" / "ssmail.db")
+    rows = store.runs()
+    assert len(rows) == len({(row.method, row.seed) for row in rows})  # each cell once
+    found = {(row.method, row.seed): recorded(store, row.id) for row in rows}
+    store.close()
+    return found
+
+
+def computed_locally(folder: Path, sweep: tuple[str, ...]) -> Numbers:
+    outcome = FrontEnd(folder, *sweep, "--jobs", "2").end()
+    assert outcome.code == 0, outcome.err
+    found = numbers(folder)
+    assert found["bc", 0] != found["bc", 1]
+    return found
+
+
+@pytest.fixture(scope="module")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Numbers:
+    """The numbers of the long sweep without a launcher."""
+    return computed_locally(tmp_path_factory.mktemp("local"), LONG)
+
+
+def test_the_sweep_as_an_array_gives_the_numbers_of_the_local_one(slurm: Cluster, tmp_path: Path) -> None:
+    outcome = FrontEnd(tmp_path / "slurm", *SWEEP, *SLURM, **slurm.environment).end()
+    assert outcome.code == 0, outcome.err
+    assert [row["outcome"] for row in outcome.rows] == ["finished"] * 4
+    assert "ssail, seed 1: epoch 3/3" in outcome.err
+    assert numbers(tmp_path / "slurm") == computed_locally(tmp_path / "local", SWEEP)
+    jobs = tmp_path / "slurm" / "results" / "slurm"
+    (script,) = jobs.glob("*_submission.sh")
+    assert "--array=0-3%4" in script.read_text()
+    assert "--time=120" in script.read_text()
+    assert list(jobs.glob("*.pkl")) == []
+
+
+def cancelled(slurm: Cluster, job: str, _: FrontEnd) -> None:
+    slurm.command("scancel", job)
+
+
+def preempted(slurm: Cluster, job: str, _: FrontEnd) -> None:
+    slurm.command("scancel", "--signal=USR2", job)
+
+
+def ctrl_c(_: Cluster, __: str, front: FrontEnd) -> None:
+    front.process.send_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize(("disturb", "code"), [(cancelled, 130), (preempted, 0), (ctrl_c, 130)])
+def test_a_sweep_that_was_disturbed_ends_with_the_same_numbers(
+    slurm: Cluster, long: Numbers, tmp_path: Path, disturb: Callable[[Cluster, str, FrontEnd], None], code: int
+) -> None:
+    front = FrontEnd(tmp_path, *LONG, *SLURM, **slurm.environment)
+    front.wait_for("seed 0: epoch 12/120")
+    running = slurm.command("squeue", "--noheader", "--array", "--format=%i", "--name=ssmail").split()
+    (first,) = [job for job in running if job.endswith("_0")]
+    disturb(slurm, first, front)
+    outcome = front.end()
+    assert outcome.code == code, outcome.err
+    if code:
+        assert outcome.rows[0]["outcome"] == "interrupted"
+        assert "interrupted; the same command continues where it stopped" in outcome.err
+        again = FrontEnd(tmp_path, *LONG, *SLURM, **slurm.environment).end()
+        assert again.code == 0, again.err
+    assert numbers(tmp_path) == long
+    store = Store.open(tmp_path / "results" / "ssmail.db")
+    assert {row.seed: row.resumes for row in store.runs()}[0] == 1  # it was hit in the middle
