@@ -13,9 +13,9 @@ from tests.execution.ray_cluster import RayCluster
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def ray_cluster() -> Iterator[RayCluster]:
-    """Two nodes."""
+    """Two nodes, of which the last test kills one."""
     cluster = RayCluster(2)
     yield cluster
     cluster.close()
@@ -39,21 +39,6 @@ def test_the_sweep_on_two_nodes_gives_the_numbers_of_the_local_one(ray_cluster: 
     assert numbers(tmp_path / "ray") == computed_locally(tmp_path / "local", SWEEP)
 
 
-def test_the_cells_of_a_killed_node_are_computed_by_the_other(
-    ray_cluster: RayCluster, long: Numbers, tmp_path: Path
-) -> None:
-    front = FrontEnd(tmp_path, *LONG, *on(ray_cluster))
-    front.wait_for("seed 0: epoch 12/120")
-    front.wait_for("seed 1: epoch 12/120")  # on the other node
-    ray_cluster.kill(ray_cluster.nodes[1])
-    outcome = front.end()
-    assert outcome.code == 0, outcome.err
-    assert [row["outcome"] for row in outcome.rows] == ["finished"] * 3
-    assert numbers(tmp_path) == long
-    store = Store.open(tmp_path / "results" / "ssmail.db")
-    assert sorted(row.resumes for row in store.runs()) == [0, 0, 1]  # the kill hit one
-
-
 def test_what_ctrl_c_leaves_is_continued_by_the_same_command(
     ray_cluster: RayCluster, long: Numbers, tmp_path: Path
 ) -> None:
@@ -69,3 +54,18 @@ def test_what_ctrl_c_leaves_is_continued_by_the_same_command(
     again = FrontEnd(tmp_path, *LONG, *on(ray_cluster)).end()
     assert again.code == 0, again.err
     assert numbers(tmp_path) == long
+
+
+def test_the_cells_of_a_killed_node_are_computed_by_the_other(
+    ray_cluster: RayCluster, long: Numbers, tmp_path: Path
+) -> None:
+    front = FrontEnd(tmp_path, *LONG, *on(ray_cluster))
+    front.wait_for("seed 0: epoch 12/120")
+    front.wait_for("seed 1: epoch 12/120")  # on the other node
+    ray_cluster.kill(ray_cluster.nodes[1])
+    outcome = front.end()
+    assert outcome.code == 0, outcome.err
+    assert [row["outcome"] for row in outcome.rows] == ["finished"] * 3
+    assert numbers(tmp_path) == long
+    store = Store.open(tmp_path / "results" / "ssmail.db")
+    assert sorted(row.resumes for row in store.runs()) == [0, 0, 1]  # the kill hit one

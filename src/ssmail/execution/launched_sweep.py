@@ -4,9 +4,9 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from ssmail.errors import InputError, SsmailError
+from ssmail.errors import InputError, SsmailError, missing_package
 from ssmail.execution import LauncherName, Resume
 from ssmail.execution.cells import Cell, Event
 from ssmail.execution.launchers import Ended, Launcher, Unended, events_of, job_text, whole
@@ -16,6 +16,7 @@ from ssmail.execution.sources import LOOK_SECONDS, attempt, elsewhere, ended_els
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.connection import BUSY_SECONDS
 
+_MOST_SECONDS = 5.0  # between two looks, however long a look takes
 CELLS = "cells"
 """The setting that every launcher has: how many cells a job computes."""
 
@@ -32,16 +33,11 @@ SINGLE = Grouping()
 
 def check_settings(name: LauncherName, settings: Mapping[str, str]) -> None:
     """Raise InputError for a wrong setting of the launcher, or without its package."""
-    whole(settings, CELLS, 1)
-    own = {key: value for key, value in settings.items() if key != CELLS}
+    _divided(settings, 1)
     if name is LauncherName.SLURM:
-        from ssmail.execution.slurm_launcher import parameters
-
-        parameters(own)
+        _slurm().parameters(_own(settings))
     else:
-        from ssmail.execution.ray_launcher import options
-
-        options(own)
+        _ray().options(_own(settings))
 
 
 def open_launcher(
@@ -51,16 +47,36 @@ def open_launcher(
 
     Raises InputError as `check_settings` does, and without its cluster.
     """
-    cells = whole(settings, CELLS, 1)
-    grouping = Grouping(cells, min(jobs, cells))
-    own = {key: value for key, value in settings.items() if key != CELLS}
+    grouping = _divided(settings, jobs)
     if name is LauncherName.SLURM:
-        from ssmail.execution.slurm_launcher import SlurmLauncher
+        folder = store.checkpoint_root.parent / "slurm"
+        return _slurm().SlurmLauncher(_own(settings), folder, grouping.processes), grouping
+    return _ray().RayLauncher(_own(settings), grouping.processes), grouping
 
-        return SlurmLauncher(own, store.checkpoint_root.parent / "slurm", grouping.processes), grouping
-    from ssmail.execution.ray_launcher import RayLauncher
 
-    return RayLauncher(own, grouping.processes), grouping
+def _divided(settings: Mapping[str, str], jobs: int) -> Grouping:
+    cells = whole(settings, CELLS, 1)
+    return Grouping(cells, min(jobs, cells))
+
+
+def _own(settings: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in settings.items() if key != CELLS}
+
+
+def _slurm() -> Any:
+    try:
+        from ssmail.execution import slurm_launcher
+    except ImportError as error:
+        raise missing_package(error, "slurm") from None
+    return slurm_launcher
+
+
+def _ray() -> Any:
+    try:
+        from ssmail.execution import ray_launcher
+    except ImportError as error:
+        raise missing_package(error, "ray") from None
+    return ray_launcher
 
 
 def launch_cells(
@@ -158,7 +174,7 @@ class _Sweep:
                 began = time.monotonic()
                 self._look()
                 if self._jobs or self._left:
-                    self._pause(max(LOOK_SECONDS, 10 * (time.monotonic() - began)))
+                    self._pause(min(max(LOOK_SECONDS, 10 * (time.monotonic() - began)), _MOST_SECONDS))
         finally:
             if self._jobs and not self._is_cancelled:
                 self._launcher.cancel()

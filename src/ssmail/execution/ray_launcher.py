@@ -3,16 +3,15 @@
 import logging
 import os
 import re
+import sys
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from typing import Any
 
-from ssmail.errors import InputError, masked, missing_package, shortened, unknown_name
-from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, whole, wrong_setting
+import ray
 
-try:
-    import ray
-except ImportError as error:
-    raise missing_package(error, "ray") from None
+from ssmail.errors import InputError, masked, shortened, unknown_name
+from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, whole, wrong_setting
 
 RETRIES = 10
 """How often a task is begun again on another node because its node died, by default."""
@@ -35,6 +34,8 @@ class RayLauncher:
                 f"{shortened(_first_line(error), 80)}); start one with `ray start --head`, or give another "
                 "--launcher-set address="
             ) from None
+        self._redirected = redirect_stdout(sys.stderr)  # Ray prints the logs of nodes that die; stdout is for results
+        self._redirected.__enter__()
         self._compute = ray.remote(**given)(compute)
         self._tasks: dict[Any, str] = {}  # names by reference
         self._submitted = 0
@@ -62,6 +63,7 @@ class RayLauncher:
     def close(self) -> None:
         """Leave the cluster, which ends the tasks that are left."""
         ray.shutdown()
+        self._redirected.__exit__(None, None, None)
 
     def _result(self, task: Any, name: str) -> Ended:
         try:

@@ -12,14 +12,11 @@ from contextlib import redirect_stderr
 from pathlib import Path
 from typing import Any
 
-from ssmail.errors import InputError, masked, missing_package, shortened, unknown_name
-from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, was_interrupted, whole
+import submitit
+from submitit.core.utils import DelayedSubmission, FailedJobError, FailedSubmissionError, pickle_load
 
-try:
-    import submitit
-    from submitit.core.utils import DelayedSubmission, FailedJobError, FailedSubmissionError, pickle_load
-except ImportError as error:
-    raise missing_package(error, "slurm") from None
+from ssmail.errors import InputError, masked, shortened, unknown_name
+from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, was_interrupted, whole
 
 MINUTES = 60
 """Time limit of a job by default. One that is not done by then is requeued, and resumes its runs."""
