@@ -246,9 +246,9 @@ class _Sweep:
 
     def _end(self, ended: Ended) -> None:
         """Report how the cells of a job have ended; what became of them without a result, the database has to tell."""
-        cells = self._jobs.pop(ended.job)
+        cells = self._jobs.pop(ended.job, [])  # none after a signal, if its cells have ended before it
         try:
-            events = events_of(ended.result, cells) if ended.result is not None else []
+            events = events_of(ended.result, cells) if cells and ended.result is not None else []
         except (ValueError, TypeError, KeyError):
             events = []
         for event in events:

@@ -1,0 +1,120 @@
+"""`--launcher` and `--launcher-set`."""
+
+import io
+import sys
+from collections.abc import Sequence
+from contextlib import redirect_stdout
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ssmail import execution
+from ssmail.execution import launched_sweep, launchers, local
+from ssmail.execution.launchers import Ended, compute
+from tests.cli.command_line import CommandLine, FakeTraining
+
+COPY = ("train", "copy-last", "--profile", "smoke", "--seeds", "0-1", "--device", "cpu")
+SLURM, RAY = ("--launcher", "slurm"), ("--launcher", "ray")
+
+
+class Here:
+    """A launcher whose jobs run when they are polled."""
+
+    def __init__(self) -> None:
+        self.jobs: list[str] = []
+        self.closed = False
+
+    def submit(self, jobs: Sequence[str]) -> list[str]:
+        self.jobs += jobs
+        return [f"job {number}" for number in range(len(jobs))]
+
+    def poll(self) -> list[Ended]:
+        jobs, self.jobs = self.jobs, []
+        with redirect_stdout(io.StringIO()):  # which is the log of a job
+            return [Ended(f"job {number}", compute(job)) for number, job in enumerate(jobs)]
+
+    def cancel(self) -> None:
+        raise AssertionError
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_a_launched_sweep_prints_what_a_local_one_does(
+    cli: CommandLine, db: Path, tmp_path: Path, fake: FakeTraining, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake()
+    monkeypatch.setattr(launchers, "run_cells", local.run_cells)
+    opened: list[Any] = []
+    here = Here()
+
+    def open_launcher(name: str, settings: dict[str, str], _: Any, jobs: int) -> Any:
+        opened.append((name, settings, jobs))
+        return here, launched_sweep.Grouping(2, jobs)
+
+    monkeypatch.setattr(launched_sweep, "check_settings", lambda *_: None)
+    monkeypatch.setattr(launched_sweep, "open_launcher", open_launcher)
+    settings = ("--launcher-set", "partition=gpu, time=120", "--launcher-set", "cells=2", "--jobs", 2)
+    launched = cli(*COPY, *SLURM, *settings, "--db", db)
+    assert launched.code == 0, launched.err
+    assert opened == [("slurm", {"partition": "gpu", "time": "120", "cells": "2"}, 2)]
+    assert here.closed
+    plain = cli(*COPY, "--db", tmp_path / "local.db")
+    own = ("run", "wall_seconds")
+    rows = [[{key: row[key] for key in row if key not in own} for row in each.rows] for each in (launched, plain)]
+    assert rows[0] == rows[1]
+    assert [row["outcome"] for row in rows[0]] == ["finished", "finished"]
+    again = cli(*COPY, *SLURM, "--db", db)
+    assert [row["outcome"] for row in again.rows] == ["skipped", "skipped"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--launcher-set", "partition=gpu"), "--launcher-set is for --launcher slurm and --launcher ray; leave it"),
+        ((*SLURM, "--launcher-set", "gpu"), "--launcher-set takes KEY=VALUE with commas between several"),
+        ((*SLURM, "--launcher-set", "time=1,"), "--launcher-set takes KEY=VALUE with commas between several"),
+        ((*RAY, "--launcher-set", "cpus="), "--launcher-set takes KEY=VALUE with commas between several"),
+        ((*SLURM, "--resume", "never"), "--launcher slurm is for --resume auto or require, not never"),
+        ((*SLURM, "--enqueue"), "--enqueue leaves the runs to `ssmail worker`, --launcher slurm does not"),
+        ((*SLURM, "--launcher-set", "cells=0"), "--launcher-set cells takes a whole number of at least 1, not '0'"),
+        (("--launcher", "kubernetes"), "kubernetes"),
+    ],
+)
+def test_what_makes_no_sense_is_one_sentence(
+    cli: CommandLine, db: Path, arguments: tuple[str, ...], sentence: str
+) -> None:
+    assert sentence in cli(*COPY, *arguments, "--db", db).sentence
+    assert not db.exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "sentence"),
+    [
+        ("submitit", (*SLURM, "--launcher-set", "partitio=gpu"), "slurm 'partitio'; did you mean partition?"),
+        ("submitit", (*SLURM, "--launcher-set", "time=2:00"), "time takes a whole number of at least 1, not '2:00'"),
+        ("ray", (*RAY, "--launcher-set", "partition=gpu"), "unknown setting of --launcher ray 'partition'; choose"),
+        ("ray", (*RAY, "--launcher-set", "cpus=-1"), "cpus takes a number such as 1 or 0.5, not '-1'"),
+        ("ray", (*RAY, "--launcher-set", "memory=much"), "memory takes a number of bytes such as 4G, not 'much'"),
+    ],
+)
+def test_a_wrong_setting_is_named(
+    cli: CommandLine, db: Path, package: str, arguments: tuple[str, ...], sentence: str
+) -> None:
+    pytest.importorskip(package, reason=f"{package}, of an extra, is not installed")
+    assert sentence in cli(*COPY, *arguments, "--db", db).sentence
+    assert not db.exists()
+
+
+@pytest.mark.parametrize(("launcher", "package"), [("slurm", "submitit"), ("ray", "ray")])
+def test_a_launcher_without_its_package_says_how_to_install_it(
+    cli: CommandLine, db: Path, fake: FakeTraining, monkeypatch: pytest.MonkeyPatch, launcher: str, package: str
+) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.delitem(sys.modules, f"ssmail.execution.{launcher}_launcher", raising=False)
+    monkeypatch.delattr(execution, f"{launcher}_launcher", raising=False)
+    said = cli(*COPY, "--launcher", launcher, "--db", db).sentence
+    assert said == f"the package {package} is not installed; run `pip install 'ssmail[{launcher}]'`"
+    fake()
+    assert cli(*COPY, "--db", db).code == 0  # nobody else needs it
