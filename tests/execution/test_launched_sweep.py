@@ -207,31 +207,32 @@ def test_a_signal_cancels_the_jobs_and_waits_for_their_runs(store: Store, cells:
     events: list[Event] = []
     claim = begin(store, cells[3])
     began: list[Claim] = []
+    polls: list[int] = []  # after the signal
 
-    def never(_: str, __: str) -> None:
+    def runs_on_for_a_while(_: str, __: str) -> None:
         if not began:
             began.append(begin(store, cells[1]))
-
-    class Stopping(FakeLauncher):
-        def cancel(self) -> None:
-            super().cancel()
+        polls.extend([1] * launcher.cancelled)
+        if len(polls) == 3:
             (own,) = began
             store.end_dead_run(own.run_id, RunState.INTERRUPTED, "stopped after epoch 1", own.owner)
+
+    def ends_late(name: str, _: str) -> Ended | None:
+        """When it is known already that its cell was interrupted."""
+        return Ended(name, None, INTERRUPTED, "cancelled") if len(polls) == 2 else None
 
     def on_event(event: Event) -> None:
         events.append(event)
         if event.kind == "epoch" and event.cell == cells[1]:
             signal.raise_signal(signal.SIGINT)
 
-    def ends_late(name: str, _: str) -> Ended | None:
-        """As a job does that SLURM ends when its cell is known to be interrupted, and others still run."""
-        return Ended(name, None, INTERRUPTED, "cancelled") if launcher.cancelled else None
-
-    launcher = Stopping({1: never, 2: ends_late})
+    launcher = FakeLauncher({1: runs_on_for_a_while, 2: ends_late})
     kinds, _ = launch(store, cells, launcher, on_event=on_event)
     assert kinds == ["finished", "interrupted", "interrupted", "interrupted"]
     assert launcher.cancelled == 1
+    assert (len(polls), launcher.jobs.keys()) == (3, {"job 1"})  # it waited for the run, and job 2 did end
     messages = {event.cell: event.message for event in events if event.kind == "interrupted"}
+    assert len(messages) == Counter(event.kind for event in events)["interrupted"] == 3
     assert messages[cells[2]] == "stopped before it started"
     assert messages[cells[3]].startswith("left to another process on ")
     assert store.run(claim.run_id).state is RunState.RUNNING  # it is not ours
