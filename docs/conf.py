@@ -52,6 +52,7 @@ docs/reference/keys
 docs/adapters
 docs/extending
 docs/database
+docs/cluster
 ```
 
 ```{toctree}

@@ -1,6 +1,7 @@
 """`--launcher` and `--launcher-set`."""
 
 import io
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -10,9 +11,11 @@ from typing import Any
 import pytest
 
 from ssmail import execution
-from ssmail.execution import launched_sweep, launchers, local
+from ssmail.execution import LauncherName, launched_sweep, launchers, local
 from ssmail.execution.launchers import Ended, compute
+from ssmail_cli.launching import parse_settings
 from tests.cli.command_line import CommandLine, FakeTraining
+from tests.execution import launched as tested
 
 COPY = ("train", "copy-last", "--profile", "smoke", "--seeds", "0-1", "--device", "cpu")
 SLURM, RAY = ("--launcher", "slurm"), ("--launcher", "ray")
@@ -118,3 +121,18 @@ def test_a_launcher_without_its_package_says_how_to_install_it(
     assert said == f"the package {package} is not installed; run `pip install 'ssmail[{launcher}]'`"
     fake()
     assert cli(*COPY, "--db", db).code == 0  # nobody else needs it
+
+
+def test_the_commands_of_the_documentation_are_those_of_the_slow_tests() -> None:
+    """With the settings that launch a real sweep in tests/execution/test_slurm.py and test_ray.py."""
+    text = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text()
+    launched = [line for line in text.splitlines() if line.startswith("ssmail train")]
+    assert len(launched) == 3
+    for line in launched:
+        words = shlex.split(line)
+        named = words[words.index("--launcher") + 1]
+        settings = parse_settings([words[words.index("--launcher-set") + 1]])
+        pytest.importorskip("submitit" if named == "slurm" else "ray", reason="an extra is not installed")
+        launched_sweep.check_settings(LauncherName(named), settings)
+        assert " ".join(tested.SLURM if named == "slurm" else RAY) in line
+        assert {"slurm": {"partition", "time"}, "ray": {"address", "cpus"}}[named] <= settings.keys()

@@ -12,6 +12,7 @@ from tests.execution.recorded import recorded
 
 SWEEP = ("train", "bc", "ssail", "--profile", "smoke", "--seeds", "0-1")
 LONG = ("train", "bc", "--profile", "smoke", "--seeds", "0-2", "--set", "training.epochs=120")
+SLURM = ("--launcher", "slurm", "--launcher-set", "partition=main,time=120")
 Numbers = dict[tuple[str, int], Any]
 
 
@@ -40,10 +41,11 @@ class FrontEnd:
         return Outcome(self.process.returncode, said, self._log.read_text())
 
 
-def numbers(folder: Path) -> dict[tuple[str, int], Any]:
-    store = Store.open(folder / "results" / "ssmail.db")
+def numbers(folder: Path, database: str | None = None) -> Numbers:
+    """What the runs recorded, by method and seed; each cell has one."""
+    store = Store.open(database or folder / "results" / "ssmail.db")
     rows = store.runs()
-    assert len(rows) == len({(row.method, row.seed) for row in rows})  # each cell once
+    assert len(rows) == len({(row.method, row.seed) for row in rows})
     found = {(row.method, row.seed): recorded(store, row.id) for row in rows}
     store.close()
     return found

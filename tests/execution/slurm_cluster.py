@@ -7,6 +7,7 @@ import socket
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -48,7 +49,7 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 
 
 class Cluster:
-    """A running SLURM. `environment` is what its commands need."""
+    """A running SLURM. `environment` is what its commands need, `host` the name of its node."""
 
     def __init__(self) -> None:
         self._missing = [name for name in _PROGRAMS if _found(name) is None]
@@ -57,6 +58,7 @@ class Cluster:
             pytest.skip(f"SLURM needs {lacks if self._missing else 'root to be started by a test'}")
         self.folder = Path(tempfile.mkdtemp(prefix="ssmail-slurm-", dir="/tmp"))
         self._daemons: list[subprocess.Popen[bytes]] = []
+        self.host = socket.gethostname()
         self.environment = {"SLURM_CONF": str(self.folder / "slurm.conf")}
         try:
             self._start()
@@ -67,7 +69,7 @@ class Cluster:
     def _start(self) -> None:
         for name in ("spool", "state"):
             (self.folder / name).mkdir()
-        host, (first, second) = socket.gethostname(), _free_ports()
+        host, (first, second) = self.host, _free_ports()
         ports = {"controller_port": first, "node_port": second}
         (self.folder / "slurm.conf").write_text(_CONF.format(host=host, folder=self.folder, cpus=CPUS, **ports))
         key = self.folder / "munge.key"
@@ -87,10 +89,10 @@ class Cluster:
             env = {**os.environ, **self.environment}
             self._daemons.append(subprocess.Popen(command, stdout=log, stderr=log, env=env, start_new_session=True))
 
-    def _wait(self, is_so: "object") -> None:
+    def _wait(self, is_so: Callable[[], bool]) -> None:
         deadline = time.monotonic() + _SECONDS
         while time.monotonic() < deadline:
-            if is_so():  # type: ignore[operator]
+            if is_so():
                 return
             time.sleep(0.2)
         logs = [f"{path.name}:\n{path.read_text(errors='replace')[-1500:]}" for path in self.folder.glob("*.*o*g")]

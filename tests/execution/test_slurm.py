@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from ssmail.store import Store
-from tests.execution.launched import LONG, SWEEP, FrontEnd, Numbers, computed_locally, numbers
+from tests.execution.launched import LONG, SLURM, SWEEP, FrontEnd, Numbers, computed_locally, numbers
 from tests.execution.slurm_cluster import Cluster
+from tests.store.postgres_server import PASSWORD, Server
 
 pytestmark = pytest.mark.slow
-SLURM = ("--launcher", "slurm", "--launcher-set", "partition=main,time=120")
 
 
 @pytest.fixture(scope="module")
@@ -23,13 +23,21 @@ def slurm() -> Iterator[Cluster]:
 
 
 @pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    running = Server()
+    yield running
+    running.close()
+
+
+@pytest.fixture(scope="module")
 def long(tmp_path_factory: pytest.TempPathFactory) -> Numbers:
     """The numbers of the long sweep without a launcher."""
     return computed_locally(tmp_path_factory.mktemp("local"), LONG)
 
 
 def test_the_sweep_as_an_array_gives_the_numbers_of_the_local_one(slurm: Cluster, tmp_path: Path) -> None:
-    outcome = FrontEnd(tmp_path / "slurm", *SWEEP, *SLURM, **slurm.environment).end()
+    here = (*SLURM, "--launcher-set", f"nodelist={slurm.host}")
+    outcome = FrontEnd(tmp_path / "slurm", *SWEEP, *here, **slurm.environment).end()
     assert outcome.code == 0, outcome.err
     assert [row["outcome"] for row in outcome.rows] == ["finished"] * 4
     assert "ssail, seed 1: epoch 3/3" in outcome.err
@@ -39,6 +47,22 @@ def test_the_sweep_as_an_array_gives_the_numbers_of_the_local_one(slurm: Cluster
     assert "--array=0-3%4" in script.read_text()
     assert "--time=120" in script.read_text()
     assert list(jobs.glob("*.pkl")) == []
+
+
+def test_the_sweep_with_a_server_gives_the_same_numbers(
+    slurm: Cluster, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Seeds of a spec in one job, and the password in the environment."""
+    database = server.new_database()
+    settings = (*SLURM, "--launcher-set", "cells=2", "--jobs", "2")
+    secret = {"SSMAIL_DB": server.url(database, None), "PGPASSWORD": PASSWORD}
+    outcome = FrontEnd(tmp_path / "slurm", *SWEEP, *settings, **secret, **slurm.environment).end()
+    assert outcome.code == 0, outcome.err
+    assert [row["outcome"] for row in outcome.rows] == ["finished"] * 4
+    (script,) = (tmp_path / "slurm" / "results" / "slurm").glob("*_submission.sh")
+    assert "--array=0-1%2" in script.read_text()
+    monkeypatch.chdir(tmp_path / "slurm")  # where its checkpoints are
+    assert numbers(tmp_path, server.url(database)) == computed_locally(tmp_path / "local", SWEEP)
 
 
 def cancelled(slurm: Cluster, job: str, _: FrontEnd) -> None:
