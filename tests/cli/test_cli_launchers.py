@@ -9,10 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.progress import Progress
 
 from ssmail import execution
+from ssmail.config.experiments import build_spec
 from ssmail.execution import LauncherName, launched_sweep, launchers, local
+from ssmail.execution.cells import Cell, Event
 from ssmail.execution.launchers import Ended, compute
+from ssmail_cli import progress
 from ssmail_cli.launching import parse_settings
 from tests.cli.command_line import CommandLine, FakeTraining
 from tests.execution import launched as tested
@@ -136,3 +140,13 @@ def test_the_commands_of_the_documentation_are_those_of_the_slow_tests() -> None
         launched_sweep.check_settings(LauncherName(named), settings)
         assert " ".join(tested.SLURM if named == "slurm" else RAY) in line
         assert {"slurm": {"partition", "time"}, "ray": {"address", "cpus"}}[named] <= settings.keys()
+
+
+def test_a_run_that_is_resumed_again_counts_its_old_epochs_once() -> None:
+    """As after a job was requeued twice, in the line of all runs together."""
+    cell = Cell(build_spec("bc", "yjunction", "smoke", ["training.epochs=9"]), 0)
+    shown = Progress(disable=True)
+    report = progress._RunningRuns(shown, {cell: "seed 0"})
+    for kind, epoch in (("loading", 0), ("resumed", 2), ("epoch", 3), ("resumed", 3), ("epoch", 4), ("resumed", 4)):
+        report(Event(kind, cell, "a" * 32, epoch, 9))  # type: ignore[arg-type]
+    assert (shown.tasks[0].completed, shown.tasks[0].total) == (2, 7)

@@ -289,9 +289,11 @@ class _Sweep:
         """After a signal, end the cells that nobody computes any more; after a second one, all."""
         for cell, left in list(self._left.items()):
             if left.kind is None:
-                row = self._store.find_cell(cell.spec.hash(), cell.seed)
                 del self._left[cell]
-                self.emit(stopped(cell, row))
+                self.emit(stopped(cell, self._store.find_cell(cell.spec.hash(), cell.seed)))
+            elif self.stop_signals > 1:
+                del self._left[cell]
+                self.emit(self._last_event(cell))
         for job, group in list(self._jobs.items()):
             unfinished = [cell for cell in group if not self._has_stopped(cell)]
             if not unfinished or self.stop_signals > 1:

@@ -61,8 +61,11 @@ class SlurmLauncher:
 
     def __init__(self, settings: Mapping[str, str], folder: Path, processes: int) -> None:
         given, requeues = parameters(settings, processes)
-        folder.mkdir(parents=True, exist_ok=True)
-        folder.chmod(0o700)  # the jobs contain the URL of the database
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            folder.chmod(0o700)  # the jobs contain the URL of the database
+        except OSError as error:
+            raise InputError(f"{folder} cannot be used for the jobs of SLURM: {error.strerror}") from None
         try:
             self._executor = submitit.SlurmExecutor(folder=folder, max_num_timeout=requeues)
         except RuntimeError:
