@@ -2,6 +2,7 @@
 
 import io
 import shlex
+import socket
 import sys
 from collections.abc import Sequence
 from contextlib import redirect_stdout
@@ -112,6 +113,23 @@ def test_a_wrong_setting_is_named(
     pytest.importorskip(package, reason=f"{package}, of an extra, is not installed")
     assert sentence in cli(*COPY, *arguments, "--db", db).sentence
     assert not db.exists()
+
+
+@pytest.mark.parametrize("setting", [True, False])
+def test_a_cluster_that_is_not_there_is_one_sentence_at_once(
+    cli: CommandLine, db: Path, monkeypatch: pytest.MonkeyPatch, setting: bool
+) -> None:
+    """Ray itself would try for minutes."""
+    pytest.importorskip("ray", reason="ray, of an extra, is not installed")
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # and does not listen
+        address = f"127.0.0.1:{closed.getsockname()[1]}"
+        monkeypatch.setenv("RAY_ADDRESS", address)
+        outcome = cli(*COPY, *RAY, *(("--launcher-set", f"address={address}") if setting else ()), "--db", db)
+    assert outcome.code == 2
+    announced, said = outcome.err.splitlines()
+    assert announced.startswith("2 runs: ")
+    assert said.startswith(f"ssmail: --launcher ray cannot reach a Ray cluster at address={address} (nothing answers ")
 
 
 @pytest.mark.parametrize(("launcher", "package"), [("slurm", "submitit"), ("ray", "ray")])

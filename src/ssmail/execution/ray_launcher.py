@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import socket
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
@@ -13,6 +14,8 @@ import ray
 from ssmail.errors import InputError, masked, shortened, unknown_name
 from ssmail.execution.launchers import FAILED, INTERRUPTED, Ended, compute, whole, wrong_setting
 
+AUTO = "auto"
+"""The address of the cluster that RAY_ADDRESS names, or to which this machine belongs."""
 RETRIES = 10
 """How often a task is begun again on another node because its node died, by default."""
 SETTINGS = ("address", "cpus", "gpus", "memory", "retries")
@@ -25,8 +28,11 @@ class RayLauncher:
     def __init__(self, settings: Mapping[str, str], processes: int) -> None:
         given = options(settings, processes)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-        address = settings.get("address", "auto")
+        address = settings.get("address", AUTO)
+        if address == AUTO:
+            address = os.environ.get("RAY_ADDRESS") or AUTO
         try:
+            _require_listener(address)
             ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise InputError(
@@ -87,6 +93,16 @@ def options(settings: Mapping[str, str], processes: int = 1) -> dict[str, Any]:
     if "memory" in settings:
         found["memory"] = _bytes(settings["memory"])
     return found
+
+
+def _require_listener(address: str) -> None:
+    """Raise ConnectionError if nothing listens at HOST:PORT, which Ray would try for minutes."""
+    found = re.fullmatch(r"(?:ray://)?\[?([^/\s]+?)\]?:(\d{1,5})", address, re.ASCII)
+    if found:
+        try:
+            socket.create_connection((found[1], int(found[2])), timeout=10).close()
+        except (OSError, OverflowError, UnicodeError):
+            raise ConnectionError("nothing answers there") from None
 
 
 def _first_line(error: Exception) -> str:
