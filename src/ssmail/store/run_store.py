@@ -26,6 +26,8 @@ from ssmail.store.writer import RunWriter, drop_metrics_after
 if TYPE_CHECKING:
     import pandas as pd
 
+_FEW = 500  # ids in a query; of more runs, all are read
+
 
 class Store:
     """An open database of runs. Many processes may use the same database at once; each opens its own Store.
@@ -117,7 +119,10 @@ class Store:
             return []
         wanted = set(run_ids)
         try:
-            return [row for row in read(self._engine, queries.runs) if row.id in wanted]
+            few = (schema.run.c.id.in_(wanted),) if len(wanted) <= _FEW else ()
+            return [
+                row for row in read(self._engine, lambda connection: queries.runs(connection, *few)) if row.id in wanted
+            ]
         except SsmailError:
             return []
 
