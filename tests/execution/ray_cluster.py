@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.test_cli_killed import children_of
+from tests.execution.slurm_cluster import ENDS_WITH_PARENT
 
 _SECONDS = 120.0  # to start in
 _MEMORY = ("--object-store-memory", "80000000", "--num-cpus", "1")
@@ -41,7 +42,16 @@ class RayCluster:
             raise
 
     def _start(self, host: str, *words: str) -> None:
-        command = (sys.executable, "-m", "ray.scripts.scripts", "start", "--block", "--node-ip-address", host)
+        command = (
+            *ENDS_WITH_PARENT,
+            sys.executable,
+            "-m",
+            "ray.scripts.scripts",
+            "start",
+            "--block",
+            "--node-ip-address",
+            host,
+        )
         with (self.folder / f"{host}.log").open("wb") as log:
             self.nodes.append(
                 subprocess.Popen(

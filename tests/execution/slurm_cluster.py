@@ -48,6 +48,10 @@ PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 """
 
 
+# what a daemon is started by, so that it ends with the tests, even if they are killed
+ENDS_WITH_PARENT = ("setpriv", "--pdeathsig", "TERM") if shutil.which("setpriv") else ()
+
+
 class Cluster:
     """A running SLURM. `environment` is what its commands need, `host` the name of its node."""
 
@@ -85,7 +89,7 @@ class Cluster:
 
     def _daemon(self, name: str, *arguments: object) -> None:
         with (self.folder / f"{name}.out").open("ab") as log:
-            command = [str(_found(name)), *map(str, arguments)]
+            command = [*ENDS_WITH_PARENT, str(_found(name)), *map(str, arguments)]
             env = {**os.environ, **self.environment}
             self._daemons.append(subprocess.Popen(command, stdout=log, stderr=log, env=env, start_new_session=True))
 
