@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ssmail.errors import InputError, command_line
-from ssmail.execution import Resume
-from ssmail_cli import completion, options
-from ssmail_cli.options import parse_seeds, pick_device
+from ssmail.execution import LauncherName, Resume
+from ssmail_cli import completion, launching, options
+from ssmail_cli.launching import Launch
+from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import chosen_format, note, print_rows
 from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
 
@@ -35,6 +36,8 @@ def control(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    launcher: launching.Name = LauncherName.LOCAL,
+    launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
@@ -61,9 +64,9 @@ def control(
         print_plan(sweep, db, resume, as_json)
         return
     if enqueue_only:
-        enqueue(sweep, db, resume, as_json)
+        enqueue(sweep, db, resume, launcher, as_json)
         return
-    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
+    rows = train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json)
     if sys.stdout.isatty() and not is_interrupted(rows):
         command = command_line("ssmail", "plot", "control", *chosen, *options.database_words(db))
         note(f"`{command}` draws these runs")

@@ -167,6 +167,7 @@ class _RunningRuns:
     def __init__(self, progress: "Progress", labels: "Mapping[Cell, str]") -> None:
         self._progress, self._labels = progress, labels
         self._tasks: dict[Cell, TaskID] = {}
+        self._resumed: set[Cell] = set()
         self._left, self._ended = sum(cell.spec.epochs for cell in labels), 0
         self._all = progress.add_task("all", total=self._left, status=self._status())
 
@@ -183,7 +184,9 @@ class _RunningRuns:
                 task = self._progress.add_task(self._labels[event.cell], total=event.epochs, start=False, status="")
                 self._tasks[event.cell] = task
             _update(self._progress, self._tasks[event.cell], event)
-            self._subtract(event.epoch)
+            if event.kind == "resumed" and event.cell not in self._resumed:  # what it computes again, it tells once
+                self._resumed.add(event.cell)
+                self._subtract(event.epoch)
 
     def _end(self, event: "Event") -> None:
         """Replace the live line of the run by a line of text above."""

@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from ssmail.errors import ExitCode, InputError, command_line, unknown_name
-from ssmail.execution import Resume
+from ssmail.execution import LauncherName, Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
-from ssmail_cli import completion, options
+from ssmail_cli import completion, launching, options
 from ssmail_cli.datasets import prep_mocap
+from ssmail_cli.launching import Launch
 from ssmail_cli.options import is_missing, noting_damage, parse_seeds
 from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
 from ssmail_cli.progress import Sweep
@@ -64,6 +65,8 @@ def reproduce(
     seeds: SeedsOfProfile = None,
     jobs: options.Jobs = 2,
     device: options.DeviceOption = options.AUTO,
+    launcher: launching.Name = LauncherName.LOCAL,
+    launcher_set: launching.Settings = None,
     cmu: CmuDir = None,
     enqueue_only: options.Enqueue = False,
     dry_run: DryRun = False,
@@ -96,9 +99,10 @@ def reproduce(
         _print_plan(figures, data, db, jobs, as_json)
         return
     if enqueue_only:
-        enqueue(_prepare(figures, data, cmu, db), db, Resume.AUTO, as_json)
+        enqueue(_prepare(figures, data, cmu, db), db, Resume.AUTO, launcher, as_json)
         return
-    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device))
+    launch = Launch.of(jobs, Resume.AUTO, device, launcher, launcher_set)
+    store, sweep, rows = _train(figures, data, cmu, db, launch)
     runs = _settled_runs(store, figures, data, sweep, rows)
     drawn = [
         _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
@@ -217,14 +221,14 @@ def _prepare(figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: st
 
 
 def _train(
-    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
+    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, launch: Launch
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, as _prepare has them. Raises typer.Exit when interrupted, too."""
     from ssmail.store import Store
 
     sweep = _prepare(figures, data, cmu, db)
     store = noting_damage(Store.open(db))
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
+    rows = result_rows(store, sweep, compute(store, sweep, launch))
     if is_interrupted(rows):
         finish(sweep, rows)
     return store, sweep, rows

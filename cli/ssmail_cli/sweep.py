@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ssmail.errors import ExitCode, InputError, command_line, sentence
-from ssmail.execution import Resume
+from ssmail.execution import LauncherName, Resume
 from ssmail.plots.formatting import counted, duration, listed, spans
+from ssmail_cli.launching import Launch
 from ssmail_cli.options import database_words, is_missing, noting_damage
 from ssmail_cli.output import Format, chosen_format, note, print_rows
 from ssmail_cli.progress import Sweep, label, reporter
@@ -25,26 +26,30 @@ if TYPE_CHECKING:
 Rows = list[dict[str, Any]]
 
 
-def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool) -> Rows:
+def train_sweep(sweep: Sweep, db: str, launch: Launch, as_json: bool) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
     from ssmail.execution.planning import check_labels
     from ssmail.store import Store
 
     check_labels(sweep)  # before there is a database
     store = noting_damage(Store.open(db))
-    announce(store, sweep, jobs, resume)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
+    announce(store, sweep, launch)
+    rows = result_rows(store, sweep, compute(store, sweep, launch))
     print_results(rows, sweep, chosen_format(as_json, None))
     return rows
 
 
-def enqueue(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
+def enqueue(sweep: Sweep, db: str, resume: Resume, launcher: LauncherName, as_json: bool) -> None:
     """Let every cell wait in the store for `ssmail worker`, and print what became of each."""
     from ssmail.execution.planning import check_labels
     from ssmail.store import Store
 
     if resume is not Resume.AUTO:
         raise InputError(f"--enqueue is for --resume auto, not {resume}; train without --enqueue for that.")
+    if launcher is not LauncherName.LOCAL:
+        raise InputError(
+            f"--enqueue leaves the runs to `ssmail worker`, --launcher {launcher} does not; leave one out."
+        )
     check_labels(sweep)
     store = noting_damage(Store.open(db))
     became = store.queue.add([(cell.spec, cell.seed) for cell in sweep])
@@ -60,10 +65,11 @@ def enqueue(sweep: Sweep, db: str, resume: Resume, as_json: bool) -> None:
         note(f"`{command}` computes them, in any number of terminals; `ssmail queue` shows them")
 
 
-def announce(store: "Store", sweep: Sweep, jobs: int, resume: Resume) -> None:
+def announce(store: "Store", sweep: Sweep, launch: Launch) -> None:
     """Print on stderr what a sweep will compute: a line for all of its runs, and one for each of several specs.
 
-    The time is estimated from the stored runs; where only smaller ones are stored, as the least that it takes.
+    The time is estimated from the stored runs; where only smaller ones are stored, as the least that it takes. It is
+    left out where a cluster decides how many runs are computed at once.
     """
     from ssmail.execution.planning import estimated_seconds, least_seconds, total_seconds
 
@@ -73,15 +79,15 @@ def announce(store: "Store", sweep: Sweep, jobs: int, resume: Resume) -> None:
     finished = store.runs(state="finished")
     seconds = estimated_seconds(finished, list(of_spec))
     least = {spec: least_seconds(finished, spec) for spec, known in seconds.items() if known is None}
-    new = [cell for cell in sweep if resume is Resume.NEVER or not _is_settled(store, cell)]
+    new = [cell for cell in sweep if launch.resume is Resume.NEVER or not _is_settled(store, cell)]
 
     def work(cells: "Collection[Cell]") -> str:
         ahead = [cell for cell in new if cell in cells]
         parts = [f"{len(cells) - len(ahead)} stored, {len(ahead)} to train"] if len(ahead) < len(cells) else []
         known = [each for cell in ahead if (each := seconds[cell.spec] or least.get(cell.spec)) is not None]
-        if known:
+        if known and launch.launcher is LauncherName.LOCAL:
             is_whole = len(known) == len(ahead) and not any(cell.spec in least for cell in ahead)
-            parts.append(f"{'about' if is_whole else 'more than'} {duration(total_seconds(known, jobs))}")
+            parts.append(f"{'about' if is_whole else 'more than'} {duration(total_seconds(known, launch.jobs))}")
         return "".join(f"; {part}" for part in parts)
 
     note(f"{counted(len(sweep), 'run')}: {_extent(sweep)}{work(sweep)}")
@@ -116,12 +122,10 @@ def print_results(rows: Rows, sweep: Sweep, form: Format) -> None:
     print_rows(rows, columns, form)
 
 
-def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str) -> "list[Event]":
+def compute(store: "Store", sweep: Sweep, launch: Launch) -> "list[Event]":
     """Compute every cell, with progress on stderr; return their final events in the order of the sweep."""
-    from ssmail.execution.local import run_cells
-
     with reporter(sweep) as report:
-        return run_cells(list(sweep), store_url=store.url, jobs=jobs, device=device, resume=resume, on_event=report)
+        return launch.compute(store, list(sweep), report)
 
 
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:

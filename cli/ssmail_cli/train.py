@@ -11,11 +11,12 @@ from typer.core import TyperCommand
 
 from ssmail.config.names import DEFAULT_ENVIRONMENT, DEFAULT_METHOD
 from ssmail.errors import InputError, command_line, shortened
-from ssmail.execution import Resume
+from ssmail.execution import LauncherName, Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import counted
-from ssmail_cli import completion, options
-from ssmail_cli.options import parse_seeds, pick_device
+from ssmail_cli import completion, launching, options
+from ssmail_cli.launching import Launch
+from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import note
 from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
 
@@ -45,6 +46,8 @@ def train(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    launcher: launching.Name = LauncherName.LOCAL,
+    launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
@@ -72,9 +75,9 @@ def train(
         print_plan(sweep, db, resume, as_json)
         return
     if enqueue_only:
-        enqueue(sweep, db, resume, as_json)
+        enqueue(sweep, db, resume, launcher, as_json)
         return
-    finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json))
+    finish(sweep, train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json))
 
 
 def ablate(
@@ -112,6 +115,8 @@ def ablate(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    launcher: launching.Name = LauncherName.LOCAL,
+    launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
@@ -139,9 +144,9 @@ def ablate(
         print_plan(sweep, db, resume, as_json)
         return
     if enqueue_only:
-        enqueue(sweep, db, resume, as_json)
+        enqueue(sweep, db, resume, launcher, as_json)
         return
-    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
+    rows = train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json)
     if sys.stdout.isatty() and not is_interrupted(rows):
         _point_to_figures(names, grid.keys, next(iter(grid.specs.values())), db)
     finish(sweep, rows)

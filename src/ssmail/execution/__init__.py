@@ -1,4 +1,7 @@
-"""Computes cells (a spec and a seed each): `ssmail.execution.local` runs them in processes on this machine."""
+"""Computes cells (a spec and a seed each): `ssmail.execution.local` runs them in processes on this machine.
+
+`ssmail.execution.launched_sweep` lets the jobs of a cluster compute them.
+"""
 
 from enum import StrEnum
 
@@ -13,3 +16,11 @@ class Resume(StrEnum):
     AUTO = "auto"
     NEVER = "never"
     REQUIRE = "require"
+
+
+class LauncherName(StrEnum):
+    """Where the processes that compute cells run: on this machine, as jobs of SLURM, or as tasks of a Ray cluster."""
+
+    LOCAL = "local"
+    SLURM = "slurm"
+    RAY = "ray"

@@ -15,6 +15,8 @@ Kind = Literal[
 ]
 NO_LONGER_STORED = "its run is no longer in the database: it was deleted, or the database replaced, meanwhile"
 """What became of a run that ended well but is not stored."""
+AUTO = "auto"
+"""The device of a cell for which the process that computes it chooses: a GPU when there is one."""
 _FINAL = ("skipped", "finished", "failed", "diverged", "interrupted")
 
 

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, Protocol
 
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
@@ -64,7 +64,7 @@ def run_cells(
         for plan in plans.values():
             if plan.skipped is not None:
                 pool.emit(plan.skipped)
-        with _counted_signals(pool):
+        with counted_signals(pool):
             pool.run()
         return [pool.results[cell] for cell in cells]
     finally:
@@ -87,7 +87,7 @@ def run_waiting(
     """
     pool = _Pool(store, source, _settings(store, device, Resume.AUTO), jobs, on_event, worker)
     pool.raises_bad_input = False
-    with _counted_signals(pool):
+    with counted_signals(pool):
         pool.run()
     return list(pool.results.values()), pool.stop_signals > 0
 
@@ -271,15 +271,21 @@ class _Pool:
                 worker.process.kill()
 
 
+class Stoppable(Protocol):
+    """What stops its work once it has seen `stop_signals`."""
+
+    stop_signals: int
+
+
 @contextmanager
-def _counted_signals(pool: _Pool) -> Iterator[None]:
+def counted_signals(work: Stoppable) -> Iterator[None]:
     """While the block runs, count SIGINT and SIGTERM instead of being ended by them (only in the main thread)."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
 
     def count(*_: Any) -> None:
-        pool.stop_signals += 1
+        work.stop_signals += 1
 
     handlers = {number: signal.signal(number, count) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -62,7 +62,7 @@ class SweepSource:
         self._groups = shares([cell for cell, plan in plans.items() if not plan.elsewhere], jobs)
         self._elsewhere: dict[Cell, RunRow] = {}
         self._news: list[Event] = []
-        self._failed = {cell: _attempt(plan.row) for cell, plan in plans.items() if plan.row is not None}
+        self._failed = {cell: attempt(plan.row) for cell, plan in plans.items() if plan.row is not None}
         self._next_look = time.monotonic() + LOOK_SECONDS
         for cell, plan in plans.items():
             if plan.elsewhere and plan.row is not None:
@@ -98,14 +98,13 @@ class SweepSource:
     def lost(self, cell: Cell, row: RunRow) -> Event:
         """Watch a cell that another process computes from now on."""
         self._elsewhere[cell] = row
-        message = f"computed by another process on {row.host}, as run {row.name}"
-        return Event("elsewhere", cell, row.id, 0, cell.spec.epochs, message=message)
+        return elsewhere(cell, row)
 
     def stop(self) -> list[Event]:
         """Leave all cells that have not been taken to others."""
         waiting = [cell for group in self._groups for cell in group]
-        events = [_stopped(cell, "stopped before it started") for cell in waiting]
-        events += [_stopped(cell, f"left to another process on {row.host}") for cell, row in self._elsewhere.items()]
+        events = [stopped(cell) for cell in waiting]
+        events += [stopped(cell, row) for cell, row in self._elsewhere.items()]
         self._groups, self._elsewhere, self._news = [], {}, []
         return events
 
@@ -119,7 +118,7 @@ class SweepSource:
 
     def _may_take(self, spec: RunSpec, row: RunRow) -> bool:
         """Whether to compute an unfinished run: not if it failed in another process since this one began."""
-        return row.state is not RunState.FAILED or _attempt(row) == self._failed.get(Cell(spec, row.seed))
+        return row.state is not RunState.FAILED or attempt(row) == self._failed.get(Cell(spec, row.seed))
 
     def _look(self) -> list[Event]:
         """Return the final events of cells that others have ended; what others have given up waits here again."""
@@ -140,16 +139,7 @@ class SweepSource:
         return events
 
     def _result(self, cell: Cell, row: RunRow) -> Event | None:
-        """Return the final event of a cell that another process has ended; None for one that it has not."""
-        epochs = cell.spec.epochs
-        by = f"by another process on {row.host}, as run {row.name}"
-        if row.state.settled:
-            epoch = epochs if row.state is RunState.FINISHED else 0
-            return Event("skipped", cell, row.id, epoch, epochs, message=f"{row.state} {by}")
-        if row.state is RunState.FAILED and _attempt(row) != self._failed.get(cell):
-            reason = (row.error or "no reason is stored").splitlines()[0]
-            return Event("failed", cell, row.id, 0, epochs, message=f"computed {by}: {reason}")
-        return None
+        return ended_elsewhere(cell, row, self._failed.get(cell))
 
 
 class QueueSource:
@@ -265,10 +255,34 @@ def _valid_spec(row: RunRow) -> RunSpec | None:
     return spec if spec.hash() == row.spec_hash else None
 
 
-def _attempt(row: RunRow | None) -> Sequence[object]:
+def attempt(row: RunRow | None) -> Sequence[object]:
     """Return what tells a failure of a run from a later one."""
     return () if row is None else (row.id, row.resumes, row.finished)
 
 
-def _stopped(cell: Cell, message: str) -> Event:
+def elsewhere(cell: Cell, row: RunRow) -> Event:
+    """Return the event of a cell that another process computes."""
+    message = f"computed by another process on {row.host}, as run {row.name}"
+    return Event("elsewhere", cell, row.id, 0, cell.spec.epochs, message=message)
+
+
+def ended_elsewhere(cell: Cell, row: RunRow, failed: Sequence[object] | None) -> Event | None:
+    """Return the final event of a cell that another process has ended; None for one that it has not.
+
+    failed: the `attempt` that had failed before.
+    """
+    epochs = cell.spec.epochs
+    by = f"by another process on {row.host}, as run {row.name}"
+    if row.state.settled:
+        epoch = epochs if row.state is RunState.FINISHED else 0
+        return Event("skipped", cell, row.id, epoch, epochs, message=f"{row.state} {by}")
+    if row.state is RunState.FAILED and attempt(row) != failed:
+        reason = (row.error or "no reason is stored").splitlines()[0]
+        return Event("failed", cell, row.id, 0, epochs, message=f"computed {by}: {reason}")
+    return None
+
+
+def stopped(cell: Cell, row: RunRow | None = None) -> Event:
+    """Return the final event of a cell that is not computed because of a signal, or is left to the process of `row`."""
+    message = f"left to another process on {row.host}" if row else "stopped before it started"
     return Event("interrupted", cell, None, 0, cell.spec.epochs, message=message)

@@ -257,18 +257,20 @@ class Store:
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
-    def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
+    def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None, *, after: int = 0) -> "pd.DataFrame":
         """Return every metric value of the runs (full ids): columns run_id, seed, name, step, value.
 
-        The rows are ordered by the start of the run, name and step.
+        The rows are ordered by the start of the run, name and step. after: only of later epochs than this one.
         """
-        return self._metrics(schema.metric, run_ids, names)
+        return self._metrics(schema.metric, run_ids, names, after)
 
     def latest_metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None) -> "pd.DataFrame":
         """Return the last value of each metric of the runs (full ids): columns run_id, name, step, value."""
         return self._metrics(schema.metric_latest, run_ids, names).drop(columns="seed")
 
-    def _metrics(self, table: Table, run_ids: Sequence[str], names: Sequence[str] | None) -> "pd.DataFrame":
+    def _metrics(
+        self, table: Table, run_ids: Sequence[str], names: Sequence[str] | None, after: int | None = None
+    ) -> "pd.DataFrame":
         import pandas as pd  # imported late so that listing runs does not wait for it
 
         run = schema.run
@@ -277,6 +279,8 @@ class Store:
         query = query.join(run, run.c.id == table.c.run_id).where(table.c.run_id.in_(list(run_ids)))
         if names is not None:
             query = query.where(table.c.name.in_(list(names)))
+        if after is not None:
+            query = query.where(table.c.step > after)
         query = query.order_by(run.c.started, run.c.id, in_byte_order(table.c.name), table.c.step)
         columns = ["run_id", "seed", "name", "step", "value"]
         with reading(self._engine) as connection:
