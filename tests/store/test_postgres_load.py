@@ -176,6 +176,7 @@ def test_the_cells_of_a_killed_worker_are_computed_by_the_others(
     assert {row.state for row in runs} == {RunState.FINISHED}
     both = [{(row.method, row.seed): recorded(one, row.id) for row in one.runs()} for one in (store, calm)]
     assert len(both[0]) == len(runs) == 6
-    assert both[0] == both[1]
+    for part, name in enumerate(("metrics", "arrays", "checkpoints")):
+        assert [cell for cell in both[0] if both[0][cell][part] != both[1][cell][part]] == [], name
     for each in (store, calm):
         each.close()
