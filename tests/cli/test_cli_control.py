@@ -138,7 +138,7 @@ def test_the_figure_draws_one_control_or_several(cli: CommandLine, fake: FakeTra
     assert "control replay: test/mode_mse against ssail, two-sided p: current-only 1, past-only 1." in outcome.err
     found = provenance.read(db.parent / "figures" / "control_replay.png")
     assert found.options["arms"] == ARMS
-    assert "Does it matter that half of D's generated batch" in found.caption
+    assert "Does it matter that part of D's generated batch" in found.caption
     several = draw(cli, db, "control", "replay", "actor", "--metric", "test/lane_balance")
     assert several.code == 3
     assert f"no run of the control actor is stored in {db}; train some with `ssmail control actor`." in several.err

@@ -61,7 +61,7 @@ def test_a_column_for_each_arm_with_its_runs_in_the_order_of_the_file(store: Sto
         "test/mode_mse of each arm (profile smoke). Points are single runs, seeds 0-2 of ssail, 0-1 of past-only; "
         "beside them median and quartiles. No runs yet of current-only."
     )
-    assert record.caption.startswith("Control replay: Does it matter that half of D's generated batch is of earlier ")
+    assert record.caption.startswith("Control replay: Does it matter that part of D's generated batch is of earlier ")
 
 
 def test_the_profile_with_the_most_runs_is_drawn_unless_one_is_named(store: Store, train: Any) -> None:
