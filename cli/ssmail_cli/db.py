@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ssmail.store.maintenance.compact import Compact
     from ssmail.store.maintenance.merge import Merge
     from ssmail.store.maintenance.run_rows import Difference
-    from ssmail.store.maintenance.sqlite_file import DatabaseInformation
+    from ssmail.store.maintenance.whole_databases import DatabaseInformation
 
 
 class DatabaseGroup(Commands):
@@ -43,7 +43,7 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
     Prints the revision of its schema, its size, the share of the arrays, and the number of runs by environment, method,
     profile and state. Does not upgrade it.
     """
-    from ssmail.store.maintenance.sqlite_file import describe_contents
+    from ssmail.store.maintenance.whole_databases import describe_contents
 
     found = describe_contents(db)
     kind = chosen_format(as_json, None)
@@ -65,7 +65,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     First writes a backup: of a file beside it, of a server's database into results/. All other commands also upgrade an
     older database when they open it, but without a backup.
     """
-    from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
+    from ssmail.store.maintenance.whole_databases import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
@@ -107,7 +107,7 @@ def backup(
     That of a server is written by pg_dump, for pg_restore. Safe while runs are being computed. Checkpoints, which are
     separate files, are not copied.
     """
-    from ssmail.store.maintenance.sqlite_file import back_up
+    from ssmail.store.maintenance.whole_databases import back_up
 
     size = back_up(db, file)
     if as_json:
@@ -173,7 +173,7 @@ def export(
     from ssmail.paper.reads import contents
     from ssmail.store import Store
     from ssmail.store.maintenance.compact import export_compact, settled_cells
-    from ssmail.store.maintenance.sqlite_file import existing, require_current
+    from ssmail.store.maintenance.whole_databases import existing, require_current
 
     if not compact:
         raise InputError(

@@ -20,7 +20,7 @@ from ssmail.errors import InputError
 from ssmail.store import RunRow, Store
 from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
 from ssmail.store.connection import as_url
-from ssmail.store.maintenance.sqlite_file import existing
+from ssmail.store.maintenance.whole_databases import existing
 from ssmail.training.batches import to_numpy
 from ssmail.training.checkpoint import UnfitState, fitted_number, load_checkpoint
 from ssmail.training.learner import Predictor

@@ -13,7 +13,7 @@ from ssmail.errors import InputError, command_line, shortened
 from ssmail.store import queries, schema
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root, fault_of
 from ssmail.store.connection import DRIVER_ERRORS, explained, name_of, reading, revision_of
-from ssmail.store.maintenance.sqlite_file import existing, opened
+from ssmail.store.maintenance.whole_databases import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
 from ssmail.store.validation import DamagedRow, raw

@@ -19,7 +19,7 @@ from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root, fau
 from ssmail.store.connection import as_url, connect, name_of, reading, writing
 from ssmail.store.maintenance.checks import Problem, damaged_rows, damaged_run, faults_of
 from ssmail.store.maintenance.run_rows import CHILDREN, Difference, amount, copy_run, first_difference
-from ssmail.store.maintenance.sqlite_file import existing, is_missing, opened, place_of, require_current, revision
+from ssmail.store.maintenance.whole_databases import existing, is_missing, opened, place_of, require_current, revision
 from ssmail.store.queries import RunRow
 from ssmail.store.validation import DamagedRow, raw
 
