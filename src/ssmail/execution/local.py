@@ -41,6 +41,7 @@ def run_cells(
     jobs: int = 1,
     device: str = "cpu",
     resume: Resume = Resume.AUTO,
+    artifacts: str | None = None,
     worker: Sequence[str] = WORKER,
 ) -> list[Event]:
     """Compute every cell in at most `jobs` processes, and return the final event of each, in the order of `cells`.
@@ -51,16 +52,19 @@ def run_cells(
     whose process stops or dies is taken over. A failing cell does not affect the others; a process that dies ends all
     its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell
     finishes its epoch and is marked interrupted; a second signal kills the workers, which loses only their current
-    epoch. Raises InputError, and computes nothing, when `resume` is NEVER and another process is computing one of the
-    cells, when it is REQUIRE and there is nothing to resume, when a label function is broken, or when the first cell
-    cannot start because of its input.
+    epoch. artifacts: a folder or URL for checkpoints (see `Store.open`).
+
+    Raises InputError, and computes nothing, when `artifacts` cannot be written to, when `resume` is NEVER and another
+    process is computing one of the cells, when it is REQUIRE and there is nothing to resume, when a label function is
+    broken, or when the first cell cannot start because of its input.
     """
     check_labels(cells)
-    store = Store.open(store_url)
+    store = Store.open(store_url, artifacts=artifacts)
     try:
+        settings = _settings(store, device, resume)
         plans = {cell: plan_cell(store, cell, resume) for cell in cells}
         source = SweepSource(store, {cell: plan for cell, plan in plans.items() if not plan.skipped}, jobs, resume)
-        pool = _Pool(store, source, _settings(store, device, resume), jobs, on_event, worker)
+        pool = _Pool(store, source, settings, jobs, on_event, worker)
         for plan in plans.values():
             if plan.skipped is not None:
                 pool.emit(plan.skipped)
@@ -93,7 +97,11 @@ def run_waiting(
 
 
 def _settings(store: Store, device: str, resume: Resume) -> RunSettings:
-    return RunSettings(device, resume, min(HEARTBEAT_SECONDS, store.stale_seconds / 4))
+    place = None
+    if store.storage is not None:
+        store.storage.require_writable()
+        place = store.storage.place
+    return RunSettings(device, resume, min(HEARTBEAT_SECONDS, store.stale_seconds / 4), place)
 
 
 class _Worker:

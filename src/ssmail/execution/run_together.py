@@ -1,6 +1,5 @@
 """Computes cells in this process: trains, stores metrics and checkpoints, and resumes unfinished runs."""
 
-import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,9 +17,10 @@ from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Kind, RunSettings
 from ssmail.execution.planning import Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
+from ssmail.store.checkpoint_files import BEST, LAST, LASTS
 from ssmail.store.queue import Claim
-from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
+from ssmail.store.recorded_checkpoints import load_recorded
+from ssmail.training.checkpoint import AFRESH, UnfitState, checkpoint_bytes, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
 
 
@@ -87,7 +87,7 @@ def run_together(
             runs.append(started)
             on_event(started.event("resumed" if started.resumed else "started"))
     with _heartbeats([run.writer for run in runs], settings.heartbeat_seconds):
-        _train([run for run in runs if run.attempt(run.record_snapshot, on_event)], on_event, should_stop)
+        _train([run for run in runs if run.attempt(run.begin, on_event)], on_event, should_stop)
 
 
 def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop, claim: Claim | None) -> "_Run | Event":
@@ -128,18 +128,13 @@ def _open_run(
 
 def _load_last(store: Store, run_id: str, loop: Loop) -> None:
     """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
-    folder = run_folder(store.checkpoint_root, run_id)
-    recorded = [row for row in store.artifacts(run_id) if row.name == LAST]
-    sha256 = recorded[0].sha256 if recorded else None  # runs of older versions record it at their end only
-    last = recorded[0].path if recorded else folder / LAST
-    if last is None or last.name not in LASTS:
-        raise InputError(f"run {run_id[:8]} has its checkpoint recorded in another folder; {AFRESH}")
-    if not os.path.lexists(last):
+    where, state = load_recorded(store, run_id, LAST)
+    if state is None:
         return
     try:
-        loop.load_state_dict(load_checkpoint(last, sha256))
+        loop.load_state_dict(state)
     except UnfitState as error:
-        raise InputError(f"the checkpoint {last} does not fit its run ({error}); {AFRESH}") from error
+        raise InputError(f"the checkpoint {where} does not fit its run ({error}); {AFRESH}") from error
 
 
 class _Run:
@@ -147,7 +142,9 @@ class _Run:
 
     # Each epoch is written in this order: metrics, arrays, checkpoint, and the checkpoint's record. So a recorded
     # checkpoint is never ahead of the database, and what a killed process stored after it is computed again, to the
-    # same bits. Two files take turns: the recorded one stays until the next one has a record.
+    # same bits. Two files take turns: the recorded one stays until the next one has a record. In a place that every
+    # machine reaches, files are objects named after their content, and a process on another machine has only the
+    # records to go by, so the best model is recorded at once, too.
 
     def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool) -> None:
         self.cell, self.loop, self.writer, self.resumed = cell, loop, writer, resumed
@@ -166,6 +163,12 @@ class _Run:
             on_event(event)
         return event is None or not event.is_final
 
+    def begin(self) -> None:
+        """Store what the loop has before its first epoch here."""
+        self.record_snapshot()
+        if self.loop.epoch and self.writer.storage and not self.writer.objects().keys() >= {BEST, LAST}:
+            self._save(best=True)  # the epochs before were computed without it
+
     def record_snapshot(self) -> None:
         if self.loop.snapshot:
             self.writer.arrays(self.loop.snapshot)
@@ -180,11 +183,7 @@ class _Run:
             return self.fail(outcome)
         self.writer.epoch(self.loop.epoch, outcome)
         self.record_snapshot()
-        if self.loop.improved:
-            save_checkpoint(self.writer.folder / BEST, self.loop.best_state_dict())
-        last = self._last_name()
-        save_checkpoint(self.writer.folder / last, self.loop.state_dict())
-        self.writer.artifact(LAST, last)
+        self._save(best=self.loop.improved)
         return self.event("epoch", outcome)
 
     def evaluate(self) -> Event:
@@ -206,6 +205,18 @@ class _Run:
             self.writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(trace)}")
         return self.event("failed", message=_summary(error))
 
+    def _save(self, best: bool) -> None:
+        """Store and record the checkpoint of this epoch, and before it the best model if there is a new one."""
+        states = {BEST: self.loop.best_state_dict()} if best else {}
+        states[LAST] = self.loop.state_dict()
+        if self.writer.storage is not None:
+            self.writer.store_objects({name: checkpoint_bytes(state) for name, state in states.items()})
+            return
+        files = {BEST: BEST, LAST: self._last_name()}
+        for name, state in states.items():
+            save_checkpoint(self.writer.folder / files[name], state)
+        self.writer.artifact(LAST, files[LAST])
+
     def _last_name(self) -> str:
         """Return the name of the checkpoint file of this epoch; that of the final one is LAST."""
         return LASTS[(self.epochs - self.loop.epoch) % 2]
@@ -213,10 +224,12 @@ class _Run:
     def _record_checkpoints(self, last: str) -> None:
         """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left."""
         folder = self.writer.folder
-        for name, file in ((BEST, BEST), (LAST, last)):
+        kept = {} if self.writer.storage else {BEST: BEST, LAST: last}  # objects are recorded already
+        for name, file in kept.items():
             if (folder / file).exists():
                 self.writer.artifact(name, file)
-        for stray in (*folder.glob(".*.partial"), *(folder / name for name in LASTS if name != last)):
+        others = (folder / file for file in (BEST, *LASTS) if file not in kept.values())
+        for stray in (*folder.glob(".*.partial"), *others):
             stray.unlink(missing_ok=True)
 
 

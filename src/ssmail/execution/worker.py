@@ -41,7 +41,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
 
     torch.set_num_threads(1)
     job = Job.from_line(line)
-    store = Store.open(job.store_url, patience=BUSY_SECONDS)
+    store = Store.open(job.store_url, patience=BUSY_SECONDS, artifacts=job.settings.artifacts)
     claims = dict(zip(job.cells, job.claims, strict=True))
     run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop, claims)
 

@@ -1,9 +1,7 @@
 """The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
-import os
 import uuid
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from copy import copy
 from datetime import datetime
 from pathlib import Path
@@ -15,6 +13,7 @@ from sqlalchemy import Connection, Engine, Table, delete, select, update
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, shortened
 from ssmail.store import arrays, queries, run_metadata, schema, server
+from ssmail.store.artifact_storage import ArtifactStorage, storage_of
 from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
 from ssmail.store.connection import connect, describe, read, reading, write
 from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
@@ -31,13 +30,16 @@ class Store:
     """An open database of runs. Many processes may use the same database at once; each opens its own Store.
 
     url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
-    checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. stale_seconds: a
-    running run whose last heartbeat is further from now than this counts as dead. damaged: the damaged rows that were
-    met so far, and left out.
+    checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. storage: where the
+    checkpoints are instead, if the user named a place. stale_seconds: a running run whose last heartbeat is further
+    from now than this counts as dead. damaged: the damaged rows that were met so far, and left out.
     """
 
-    def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS) -> None:
+    def __init__(
+        self, engine: Engine, stale_seconds: float = STALE_SECONDS, storage: ArtifactStorage | None = None
+    ) -> None:
         self._engine = engine
+        self.storage = storage
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
         self.stale_seconds = stale_seconds
@@ -46,14 +48,23 @@ class Store:
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
-    def open(cls, where: str | Path, *, stale_seconds: float | None = None, patience: float = 0.0) -> Self:
+    def open(
+        cls,
+        where: str | Path,
+        *,
+        stale_seconds: float | None = None,
+        patience: float = 0.0,
+        artifacts: str | None = None,
+    ) -> Self:
         """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
-        patience: how many seconds to wait for a server that cannot be reached.
-        Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
+        patience: how many seconds to wait for a server that cannot be reached. artifacts: a folder or URL for
+        checkpoints, by default that of SSMAIL_ARTIFACTS.
+        Raises InputError when a place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        stale = _stale_seconds() if stale_seconds is None else stale_seconds
-        return cls(connect(where, patience), stale)
+        stale = queries.chosen_stale_seconds() if stale_seconds is None else stale_seconds
+        storage = storage_of(artifacts)
+        return cls(connect(where, patience), stale, storage)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -176,11 +187,12 @@ class Store:
             insert_row(connection, row, queries.clock(connection))
 
         write(self._engine, start)
-        return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"])
+        return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"], storage=self.storage)
 
     def resume_run(self, run_id: str, from_step: int, claim: Claim | None = None, **begun: str | None) -> RunWriter:
         """Continue an unfinished run after epoch `from_step`, dropping the metrics of later epochs.
 
+        From step 0, the records of checkpoints are dropped too: they would be ahead of the metrics.
         With a claim of the run, only who made it may do so. begun: its columns dataset_hash and device, if they change.
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the run
         or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
@@ -198,6 +210,8 @@ class Store:
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
+            if from_step == 0:
+                connection.execute(delete(schema.artifact).where(schema.artifact.c.run_id == run_id))
             before = claimed or row  # as it was before an attempt of which the answer was lost
             changes = {
                 "state": RunState.RUNNING,
@@ -213,7 +227,7 @@ class Store:
             return row
 
         row = write(self._engine, resume)
-        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row)
+        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row, storage=self.storage)
 
     def mark_stale(self) -> list[RunRow]:
         """Mark the RUNNING runs without a recent heartbeat as INTERRUPTED; return their rows from before the change."""
@@ -233,20 +247,27 @@ class Store:
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
 
-        Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed. A damaged
-        run is deleted too, whatever it says of its process.
+        In the storage, those objects are deleted that they recorded. Raises InputError, and deletes nothing, when an id
+        is unknown or ambiguous or a run is being computed. A damaged run is deleted too, whatever it says of its
+        process.
         """
         full: list[str] = []
+        objects: dict[str, list[str]] = {}
 
         def delete_idle(connection: Connection, again: bool) -> None:
             full[:] = full if again and full else queries.resolve(connection, run_ids)
             for row in queries.runs(connection, schema.run.c.id.in_(full), for_update=True):
                 self.require_idle(row)
+            for run_id in full:
+                found = queries.artifacts(connection, run_id, self.checkpoint_root)
+                objects[run_id] = [row.sha256 for row in found] or objects.get(run_id, [])
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
 
         write(self._engine, delete_idle)
         for run_id in filter(schema.is_run_id, full):
             remove_run_folder(self.checkpoint_root, run_id)
+            if self.storage is not None:
+                self.storage.remove(run_id, objects[run_id])
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
@@ -326,12 +347,3 @@ class Store:
     def is_compact(self, run: RunRow) -> bool:
         """Return whether a run that ended has no checkpoint: a compact database keeps only what figures read of it."""
         return run.state.settled and not self.artifacts(run.id)
-
-
-def _stale_seconds() -> float:
-    """Return the value of SSMAIL_STALE_SECONDS, by default STALE_SECONDS. Raises InputError if it is no such number."""
-    text = os.environ.get("SSMAIL_STALE_SECONDS")
-    with suppress(ValueError):
-        if text is None or 0 < float(text) < 1e6:
-            return STALE_SECONDS if text is None else float(text)
-    raise InputError(f"SSMAIL_STALE_SECONDS is {shortened(str(text), 40)!r}; give a number of seconds above 0")
