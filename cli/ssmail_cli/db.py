@@ -78,7 +78,11 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 
 
 @app.command()
-def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
+def check(
+    as_json: Json = False,
+    artifacts: options.ArtifactsGiven = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
     """Look for problems in the database and its checkpoints.
 
     Prints one line for each problem, with its remedy, and changes nothing. Reads the whole file and all checkpoints;
@@ -86,7 +90,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
     """
     from ssmail.store.maintenance.checks import check as check_database
 
-    problems = check_database(db)
+    problems = check_database(db, artifacts)
     if as_json:
         write_json([asdict(problem) for problem in problems], None)
     for problem in problems if not as_json else ():
@@ -123,6 +127,7 @@ def merge(
         typer.Argument(metavar="OTHER.db", help="The file or URL of the database to take runs from; it is only read."),
     ],
     as_json: Json = False,
+    artifacts: options.Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Add the runs of another database to this one.
@@ -133,7 +138,7 @@ def merge(
     """
     from ssmail.store.maintenance.merge import merge as merge_databases
 
-    done = merge_databases(db, other)
+    done = merge_databases(db, other, artifacts)
     if as_json:
         runs = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.runs]
         differences = [asdict(difference) for difference in done.differences]

@@ -89,6 +89,26 @@ Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
 ]
+
+
+def _known_artifacts(place: str | None) -> str | None:
+    """Return the place as given. Raises InputError for one that cannot be one, or whose driver is not installed."""
+    from ssmail.store.artifact_storage import ArtifactStorage
+
+    return place and ArtifactStorage(place) and place
+
+
+def _artifacts_option(text: str) -> Any:
+    return typer.Option(
+        "--artifacts", envvar="SSMAIL_ARTIFACTS", metavar="DIR|URL", callback=_known_artifacts, help=text
+    )
+
+
+Artifacts = Annotated[
+    str | None,
+    _artifacts_option("Keep checkpoints in a folder or URL (s3://..., as fsspec has them) that all machines reach."),
+]
+ArtifactsGiven = Annotated[str | None, _artifacts_option("The folder or URL where training kept its checkpoints.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, with NaN and infinities as text.")]
 Output = Annotated[
     Format | None,
@@ -236,6 +256,7 @@ def open_store(
     database: str,
     made_by: str = "ssmail train --method ssail --profile quick --seeds 0-4",
     mark_dead: bool = True,
+    artifacts: str | None = None,
 ) -> "Store":
     """Open the store for reading, after marking runs whose process has died as interrupted, where possible.
 
@@ -245,7 +266,7 @@ def open_store(
 
     if is_missing(database):
         raise InputError(f"there is no database {database}; `{made_by}` makes one, or name another with --db.")
-    store = noting_damage(Store.open(database))
+    store = noting_damage(Store.open(database, artifacts=artifacts))
     if mark_dead and not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()

@@ -70,6 +70,7 @@ def reproduce(
     out: options.OutDir = options.DEFAULT_OUT,
     formats: options.Formats = options.DEFAULT_FORMATS,
     stat: options.StatOfFigures = None,
+    artifacts: options.Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
@@ -93,7 +94,7 @@ def reproduce(
     if dry_run:
         _print_plan(figures, data, db, jobs, as_json)
         return
-    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device))
+    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device), artifacts)
     runs = _settled_runs(store, figures, data, sweep, rows)
     drawn = [
         _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
@@ -195,7 +196,13 @@ def _trainable(figures: Mapping[str, Sweep], data: _Data) -> Sweep:
 
 
 def _train(
-    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, jobs: int, device: str
+    figures: Mapping[str, Sweep],
+    data: _Data,
+    cmu: Path | None,
+    db: str,
+    jobs: int,
+    device: str,
+    artifacts: str | None = None,
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, the longest first.
 
@@ -211,7 +218,7 @@ def _train(
     for path in sorted({path for name in data.made for path, _ in _absent_files(figures[name])}):
         with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
             prep_mocap(source=cmu, out=Path(path))
-    store = noting_damage(Store.open(db))
+    store = noting_damage(Store.open(db, artifacts=artifacts))
     rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
     if is_interrupted(rows):
         finish(sweep, rows)

@@ -25,7 +25,7 @@ from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics, rows_
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from ssmail.store import RunRow, Store
+    from ssmail.store import ArtifactRow, RunRow, Store
 
 
 class RunsGroup(Commands):
@@ -238,16 +238,19 @@ def delete(
         typer.Argument(metavar="RUN", help="Ids of runs, or their first digits.", autocompletion=completion.run_ids),
     ],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without asking.")] = False,
+    artifacts: options.ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Delete runs and their checkpoints.
 
-    Refuses to delete a run that is being computed.
+    Refuses to delete a run that is being computed. A copy of the run in another database has the same checkpoints in
+    --artifacts, and loses them.
     """
     import sys
 
-    store = options.open_store(db)
+    store = options.open_store(db, artifacts=artifacts)
     full = store.full_ids(ids)
+    left = store.storage is None and any(item.by_content for run_id in full for item in store.artifacts(run_id))
     known = {run.id: f"{run.method}, seed {run.seed}, {run.state}" for run in store.runs()}
     names = ", ".join(f"{run_id[:8]} ({known.get(run_id, 'damaged')})" for run_id in full)
     if not yes:
@@ -258,6 +261,8 @@ def delete(
             raise typer.Exit(ExitCode.FAILURE)
     store.delete(full)
     note(f"deleted {names}")
+    if left:
+        note("their checkpoints are where --artifacts put them: nothing is deleted there without --artifacts")
 
 
 def _order(sort: str | None, descending: bool) -> tuple[str | None, bool]:
@@ -319,10 +324,17 @@ def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
         "metrics": _values(store.latest_metrics([run.id])),
         "arrays": store.array_names(run.id),
         "artifacts": [
-            {"name": item.name, "path": item.path, "sha256": item.sha256, "size_bytes": item.size_bytes}
+            {"name": item.name, "path": _place(store, item), "sha256": item.sha256, "size_bytes": item.size_bytes}
             for item in store.artifacts(run.id)
         ],
     }
+
+
+def _place(store: "Store", item: "ArtifactRow") -> str | None:
+    """Return where a checkpoint is; of an object whose place is not given, its name there."""
+    if item.by_content and store.storage is not None:
+        return store.storage.name_of(item)
+    return f"{item.run_id}/{item.sha256}" if item.by_content else item.path and str(item.path)
 
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:

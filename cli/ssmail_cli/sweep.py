@@ -25,13 +25,15 @@ if TYPE_CHECKING:
 Rows = list[dict[str, Any]]
 
 
-def train_sweep(sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool) -> Rows:
+def train_sweep(
+    sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool, artifacts: str | None = None
+) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
     from ssmail.execution.planning import check_labels
     from ssmail.store import Store
 
     check_labels(sweep)  # before there is a database
-    store = noting_damage(Store.open(db))
+    store = noting_damage(Store.open(db, artifacts=artifacts))
     announce(store, sweep, jobs, resume)
     rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
     print_results(rows, sweep, chosen_format(as_json, None))
@@ -121,7 +123,15 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str
     from ssmail.execution.local import run_cells
 
     with reporter(sweep) as report:
-        return run_cells(list(sweep), store_url=store.url, jobs=jobs, device=device, resume=resume, on_event=report)
+        return run_cells(
+            list(sweep),
+            store_url=store.url,
+            artifacts=store.storage.place if store.storage else None,
+            jobs=jobs,
+            device=device,
+            resume=resume,
+            on_event=report,
+        )
 
 
 def result_rows(store: "Store", sweep: Sweep, events: "Sequence[Event]") -> Rows:

@@ -48,6 +48,7 @@ def train(
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
+    artifacts: options.Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train methods with one or several seeds.
@@ -74,7 +75,7 @@ def train(
     if enqueue_only:
         enqueue(sweep, db, resume, as_json)
         return
-    finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json))
+    finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts))
 
 
 def ablate(
@@ -115,6 +116,7 @@ def ablate(
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
+    artifacts: options.Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train a method for several values of one key of its spec, or for a grid of values of several keys.
@@ -141,7 +143,7 @@ def ablate(
     if enqueue_only:
         enqueue(sweep, db, resume, as_json)
         return
-    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json)
+    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts)
     if sys.stdout.isatty() and not is_interrupted(rows):
         _point_to_figures(names, grid.keys, next(iter(grid.specs.values())), db)
     finish(sweep, rows)

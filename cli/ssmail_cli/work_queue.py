@@ -61,6 +61,7 @@ def worker(
         ),
     ] = None,
     as_json: options.Json = False,
+    artifacts: options.Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Compute the runs that wait in the queue of the database.
@@ -77,7 +78,7 @@ def worker(
     for name, value in (("--max-hours", max_hours), ("--idle-exit", idle_exit)):
         if value is not None and not 0 <= value < math.inf:
             raise InputError(f"{name} takes a number that is not negative, not {value}.")
-    store = open_store(db, MADE_BY, mark_dead=False)  # what is dead is shown, or taken over, as such
+    store = open_store(db, MADE_BY, mark_dead=False, artifacts=artifacts)  # what is dead is taken over as such
     source = QueueSource(store, max_cells, max_hours, idle_exit, data or ())
     chosen = pick_device(device)
     events, stopped = run_waiting(source, store=store, on_event=worker_log(), jobs=jobs, device=chosen)

@@ -85,7 +85,7 @@ def run_together(
             on_event(started)
         else:
             runs.append(started)
-            on_event(started.event("resumed" if started.resumed else "started"))
+            on_event(started.event("resumed" if started.resumed else "started", message=started.remark))
     with _heartbeats([run.writer for run in runs], settings.heartbeat_seconds):
         _train([run for run in runs if run.attempt(run.begin, on_event)], on_event, should_stop)
 
@@ -99,8 +99,8 @@ def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop,
         if settings.device.startswith("cuda") and not torch.cuda.is_available():
             raise InputError("PyTorch finds no CUDA device on this machine; use --device cpu")
         loop = make_loop(cell.spec, cell.seed, settings.device)
-        writer = _open_run(cell, store, settings, plan, loop, claim)
-        return _Run(cell, loop, writer, resumed=plan.row is not None and plan.row.has_begun)
+        writer, remark = _open_run(cell, store, settings, plan, loop, claim)
+        return _Run(cell, loop, writer, resumed=plan.row is not None and plan.row.has_begun, remark=remark)
     except Exception as error:
         bad_input = isinstance(error, InputError)
         return Event("failed", cell, None, 0, cell.spec.epochs, message=_summary(error), bad_input=bad_input)
@@ -108,33 +108,39 @@ def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop,
 
 def _open_run(
     cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop: Loop, claim: Claim | None
-) -> RunWriter:
-    """Start a new run, or resume the planned one and load its last checkpoint into `loop`."""
+) -> tuple[RunWriter, str]:
+    """Start a new run, or resume the planned one and load its last checkpoint into `loop`.
+
+    Returns the writer, and what there is to say.
+    """
+    begun = {"dataset_hash": loop.dataset_hash, "device": settings.device}
     if plan.row is None:
         repeat = settings.resume is Resume.NEVER
-        return store.start_run(
-            cell.spec, cell.seed, dataset_hash=loop.dataset_hash, device=settings.device, repeat=repeat
-        )
+        return store.start_run(cell.spec, cell.seed, repeat=repeat, **begun), ""
     if not plan.row.has_begun:
-        begun = {"dataset_hash": loop.dataset_hash, "device": settings.device}
-        return store.resume_run(plan.row.id, 0, claim, **begun)
+        return store.resume_run(plan.row.id, 0, claim, **begun), ""
     if plan.row.dataset_hash != loop.dataset_hash:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
-    _load_last(store, plan.row.id, loop)
-    return store.resume_run(plan.row.id, loop.epoch, claim)
+    remark = _load_last(store, plan.row.id, loop)
+    return store.resume_run(plan.row.id, loop.epoch, claim), remark
 
 
-def _load_last(store: Store, run_id: str, loop: Loop) -> None:
-    """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
+def _load_last(store: Store, run_id: str, loop: Loop) -> str:
+    """Load the run's last checkpoint into `loop`; return what there is to say if it recorded one that is missing.
+
+    Raises InputError when it is not as recorded.
+    """
     where, state = load_recorded(store, run_id, LAST)
     if state is None:
-        return
+        recorded = any(row.name == LAST for row in store.artifacts(run_id))
+        return "its checkpoint is not here, nor where --artifacts says, so it starts again" if recorded else ""
     try:
         loop.load_state_dict(state)
     except UnfitState as error:
         raise InputError(f"the checkpoint {where} does not fit its run ({error}); {AFRESH}") from error
+    return ""
 
 
 class _Run:
@@ -146,8 +152,8 @@ class _Run:
     # machine reaches, files are objects named after their content, and a process on another machine has only the
     # records to go by, so the best model is recorded at once, too.
 
-    def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool) -> None:
-        self.cell, self.loop, self.writer, self.resumed = cell, loop, writer, resumed
+    def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool, remark: str = "") -> None:
+        self.cell, self.loop, self.writer, self.resumed, self.remark = cell, loop, writer, resumed, remark
         self.epochs = cell.spec.epochs
 
     def event(self, kind: Kind, metrics: Mapping[str, float] | None = None, message: str = "") -> Event:
