@@ -95,7 +95,9 @@ def _known_artifacts(place: str | None) -> str | None:
     """Return the place as given. Raises InputError for one that cannot be one, or whose driver is not installed."""
     from ssmail.store.artifact_storage import ArtifactStorage
 
-    return place and ArtifactStorage(place) and place
+    if place:
+        ArtifactStorage(place)
+    return place
 
 
 def _artifacts_option(text: str) -> Any:

@@ -25,7 +25,7 @@ from ssmail_cli.run_table import ENVIRONMENT_METRICS, environment_metrics, rows_
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from ssmail.store import ArtifactRow, RunRow, Store
+    from ssmail.store import RunRow, Store
 
 
 class RunsGroup(Commands):
@@ -318,23 +318,23 @@ def _values(metrics: "DataFrame") -> list[dict[Any, Any]]:
 
 
 def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
+    from ssmail.store.artifact_storage import place_of
+
     return {
         "run": run_row(run),
         "spec": run.spec,
         "metrics": _values(store.latest_metrics([run.id])),
         "arrays": store.array_names(run.id),
         "artifacts": [
-            {"name": item.name, "path": _place(store, item), "sha256": item.sha256, "size_bytes": item.size_bytes}
+            {
+                "name": item.name,
+                "path": place_of(item, store.storage),
+                "sha256": item.sha256,
+                "size_bytes": item.size_bytes,
+            }
             for item in store.artifacts(run.id)
         ],
     }
-
-
-def _place(store: "Store", item: "ArtifactRow") -> str | None:
-    """Return where a checkpoint is; of an object whose place is not given, its name there."""
-    if item.by_content and store.storage is not None:
-        return store.storage.name_of(item)
-    return f"{item.run_id}/{item.sha256}" if item.by_content else item.path and str(item.path)
 
 
 def _detail_rows(details: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -242,6 +242,13 @@ def storage_of(place: str | None) -> ArtifactStorage | None:
     return ArtifactStorage(place) if place else None
 
 
+def place_of(row: ArtifactRow, storage: ArtifactStorage | None) -> str | None:
+    """Return where a recorded checkpoint should be; of an object in a place that is not given, its name there."""
+    if row.by_content:
+        return storage.name_of(row) if storage is not None else f"{row.run_id}/{row.sha256}"
+    return None if row.path is None else str(row.path)
+
+
 def recorded_fault(row: ArtifactRow, storage: ArtifactStorage | None) -> str | None:
     """Return what is wrong with a recorded checkpoint: None if its object or its file is as recorded.
 

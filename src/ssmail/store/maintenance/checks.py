@@ -11,7 +11,7 @@ from sqlalchemy import URL, Connection, select
 from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.store import queries, schema
-from ssmail.store.artifact_storage import NOT_GIVEN, ArtifactStorage, recorded_fault, storage_of
+from ssmail.store.artifact_storage import NOT_GIVEN, ArtifactStorage, place_of, recorded_fault, storage_of
 from ssmail.store.checkpoint_files import STAGING, checkpoint_root
 from ssmail.store.connection import DRIVER_ERRORS, explained, name_of, reading, revision_of
 from ssmail.store.maintenance.whole_databases import existing, opened
@@ -44,7 +44,8 @@ class Problem:
 def check(where: str | Path, artifacts: str | None = None) -> list[Problem]:
     """Return all problems of a database. Safe while runs are being computed.
 
-    artifacts: where its checkpoints are, if not beside it (see `Store.open`). Raises InputError when the database is missing, is not one of ssmail's, or is from a newer ssmail.
+    artifacts: where its checkpoints are, if not beside it (see `Store.open`). Raises InputError when the database is
+    missing, is not one of ssmail's, or is from a newer ssmail.
     """
     url, storage = existing(where), storage_of(artifacts)
     folders = _checkpoint_folders(url)  # read before the runs, because a run has its row before its folder
@@ -187,7 +188,7 @@ def _silent(connection: Connection) -> Iterator[Problem]:
 def _checkpoints(
     url: URL, connection: Connection, runs: Sequence[RunRow], storage: ArtifactStorage | None
 ) -> Iterator[Problem]:
-    """Check that the recorded files and objects exist with the recorded content; those of a run at work change meanwhile."""
+    """Check that the recorded files and objects are as recorded; those of a run at work change meanwhile."""
     now = queries.clock(connection)
     for run in runs:
         if run.is_alive(now=now):
@@ -195,7 +196,7 @@ def _checkpoints(
         for row in queries.artifacts(connection, run.id, checkpoint_root(url)):
             if wrong := recorded_fault(row, storage):
                 again = _again(run.name)
-                place = storage.name_of(row) if storage is not None and row.by_content else row.path
+                place = place_of(row, storage)
                 remedy = f"copy it from a backup to {place}, or {again}" if place else again
                 remedy = "give that place with --artifacts" if wrong is NOT_GIVEN else remedy
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)

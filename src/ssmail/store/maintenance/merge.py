@@ -76,8 +76,8 @@ def merge(where: str | Path, other: str | Path, artifacts: str | None = None) ->
 
     Runs with damaged rows are left out. The merge is one transaction: if it fails, or the process dies at any moment,
     the target keeps its contents. artifacts: a folder or URL that has the checkpoints of both databases, or gets those
-    beside `other` (see `Store.open`); nothing is deleted there. Raises InputError when a database cannot be used, when both are the same one, or when
-    one has another schema.
+    beside `other` (see `Store.open`); nothing is deleted there. Raises InputError when a database cannot be used, when
+    both are the same one, or when one has another schema.
     """
     source, target, storage = existing(other), as_url(where), storage_of(artifacts)
     if _is_same(source, target):
