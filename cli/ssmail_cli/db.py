@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError, stored_values
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
+from ssmail_cli.artifacts import Artifacts, ArtifactsGiven
 from ssmail_cli.command_group import Commands
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, write_json
 
@@ -80,7 +81,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 @app.command()
 def check(
     as_json: Json = False,
-    artifacts: options.ArtifactsGiven = None,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Look for problems in the database and its checkpoints.
@@ -127,7 +128,7 @@ def merge(
         typer.Argument(metavar="OTHER.db", help="The file or URL of the database to take runs from; it is only read."),
     ],
     as_json: Json = False,
-    artifacts: options.Artifacts = None,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Add the runs of another database to this one.

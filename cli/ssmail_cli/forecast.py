@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from ssmail_cli import options
+from ssmail_cli.artifacts import ArtifactsGiven
 from ssmail_cli.output import note, say, write_json
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ def forecast(
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
     as_json: options.Json = False,
-    artifacts: options.ArtifactsGiven = None,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Sample the futures of observed agents with the trained model of a run.
@@ -89,7 +90,7 @@ def export_model(
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
     as_json: options.Json = False,
-    artifacts: options.ArtifactsGiven = None,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Export the trained model of a run for use without ssmail.

@@ -91,26 +91,6 @@ Database = Annotated[
 ]
 
 
-def _known_artifacts(place: str | None) -> str | None:
-    """Return the place as given. Raises InputError for one that cannot be one, or whose driver is not installed."""
-    from ssmail.store.artifact_storage import ArtifactStorage
-
-    if place:
-        ArtifactStorage(place)
-    return place
-
-
-def _artifacts_option(text: str) -> Any:
-    return typer.Option(
-        "--artifacts", envvar="SSMAIL_ARTIFACTS", metavar="DIR|URL", callback=_known_artifacts, help=text
-    )
-
-
-Artifacts = Annotated[
-    str | None,
-    _artifacts_option("Keep checkpoints in a folder or URL (s3://..., as fsspec has them) that all machines reach."),
-]
-ArtifactsGiven = Annotated[str | None, _artifacts_option("The folder or URL where training kept its checkpoints.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, with NaN and infinities as text.")]
 Output = Annotated[
     Format | None,
@@ -207,9 +187,12 @@ DeviceOption = Annotated[
         "--device",
         metavar="DEVICE",
         callback=_known_device,
-        help="auto (a GPU when there is one), cpu, cuda, or cuda:1 for the second GPU.",
+        help="auto (the GPUs, if there are any), cpu, cuda (the GPUs), or cuda:1 for the second GPU.",
         autocompletion=lambda: list(DEVICES),
     ),
+]
+PerDevice = Annotated[
+    int, typer.Option("--per-device", min=1, help="Processes that use a GPU at the same time; --jobs is for all.")
 ]
 Enqueue = Annotated[
     bool, typer.Option("--enqueue", help="Put the runs into the queue of the database for `ssmail worker`, and end.")

@@ -13,6 +13,7 @@ from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import completion, options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.datasets import prep_mocap
 from ssmail_cli.options import is_missing, noting_damage, parse_seeds
 from ssmail_cli.output import OutputError, chosen_format, error_line, note, print_rows
@@ -64,13 +65,14 @@ def reproduce(
     seeds: SeedsOfProfile = None,
     jobs: options.Jobs = 2,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     cmu: CmuDir = None,
     dry_run: DryRun = False,
     as_json: options.Json = False,
     out: options.OutDir = options.DEFAULT_OUT,
     formats: options.Formats = options.DEFAULT_FORMATS,
     stat: options.StatOfFigures = None,
-    artifacts: options.Artifacts = None,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
@@ -94,7 +96,7 @@ def reproduce(
     if dry_run:
         _print_plan(figures, data, db, jobs, as_json)
         return
-    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device), artifacts)
+    store, sweep, rows = _train(figures, data, cmu, db, jobs, options.pick_device(device), artifacts, per_device)
     runs = _settled_runs(store, figures, data, sweep, rows)
     drawn = [
         _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
@@ -202,7 +204,8 @@ def _train(
     db: str,
     jobs: int,
     device: str,
-    artifacts: str | None = None,
+    artifacts: str | None,
+    per_device: int,
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, the longest first.
 
@@ -219,7 +222,7 @@ def _train(
         with redirect_stdout(sys.stderr):  # stdout is for the paths of the figures
             prep_mocap(source=cmu, out=Path(path))
     store = noting_damage(Store.open(db, artifacts=artifacts))
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device))
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, Resume.AUTO, device, per_device))
     if is_interrupted(rows):
         finish(sweep, rows)
     return store, sweep, rows

@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.plots.formatting import counted
 from ssmail_cli import comparison_tables, completion, options
+from ssmail_cli.artifacts import ArtifactsGiven
 from ssmail_cli.command_group import Commands
 from ssmail_cli.output import (
     Format,
@@ -238,7 +239,7 @@ def delete(
         typer.Argument(metavar="RUN", help="Ids of runs, or their first digits.", autocompletion=completion.run_ids),
     ],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without asking.")] = False,
-    artifacts: options.ArtifactsGiven = None,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Delete runs and their checkpoints.
@@ -262,7 +263,7 @@ def delete(
     store.delete(full)
     note(f"deleted {names}")
     if left:
-        note("their checkpoints are where --artifacts put them: nothing is deleted there without --artifacts")
+        note("their checkpoints stay where --artifacts put them, unless --artifacts is given here too")
 
 
 def _order(sort: str | None, descending: bool) -> tuple[str | None, bool]:

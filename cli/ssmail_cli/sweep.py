@@ -26,7 +26,7 @@ Rows = list[dict[str, Any]]
 
 
 def train_sweep(
-    sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool, artifacts: str | None = None
+    sweep: Sweep, db: str, jobs: int, resume: Resume, device: str, as_json: bool, artifacts: str | None, per_device: int
 ) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
     from ssmail.execution.planning import check_labels
@@ -35,7 +35,7 @@ def train_sweep(
     check_labels(sweep)  # before there is a database
     store = noting_damage(Store.open(db, artifacts=artifacts))
     announce(store, sweep, jobs, resume)
-    rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device))
+    rows = result_rows(store, sweep, compute(store, sweep, jobs, resume, device, per_device))
     print_results(rows, sweep, chosen_format(as_json, None))
     return rows
 
@@ -118,7 +118,7 @@ def print_results(rows: Rows, sweep: Sweep, form: Format) -> None:
     print_rows(rows, columns, form)
 
 
-def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str) -> "list[Event]":
+def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str, per_device: int) -> "list[Event]":
     """Compute every cell, with progress on stderr; return their final events in the order of the sweep."""
     from ssmail.execution.local import run_cells
 
@@ -129,6 +129,7 @@ def compute(store: "Store", sweep: Sweep, jobs: int, resume: Resume, device: str
             artifacts=store.storage.place if store.storage else None,
             jobs=jobs,
             device=device,
+            per_device=per_device,
             resume=resume,
             on_event=report,
         )

@@ -15,6 +15,7 @@ from ssmail.execution import Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import counted
 from ssmail_cli import completion, options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.options import parse_seeds, pick_device
 from ssmail_cli.output import note
 from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
@@ -45,10 +46,11 @@ def train(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
-    artifacts: options.Artifacts = None,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train methods with one or several seeds.
@@ -75,7 +77,7 @@ def train(
     if enqueue_only:
         enqueue(sweep, db, resume, as_json)
         return
-    finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts))
+    finish(sweep, train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts, per_device))
 
 
 def ablate(
@@ -113,10 +115,11 @@ def ablate(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
-    artifacts: options.Artifacts = None,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train a method for several values of one key of its spec, or for a grid of values of several keys.
@@ -143,7 +146,7 @@ def ablate(
     if enqueue_only:
         enqueue(sweep, db, resume, as_json)
         return
-    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts)
+    rows = train_sweep(sweep, db, jobs, resume, pick_device(device), as_json, artifacts, per_device)
     if sys.stdout.isatty() and not is_interrupted(rows):
         _point_to_figures(names, grid.keys, next(iter(grid.specs.values())), db)
     finish(sweep, rows)

@@ -76,6 +76,7 @@ def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
         jobs: int,
         device: str,
         resume: Resume,
+        per_device: int,
         artifacts: str | None,
     ) -> list[Event]:
         store, settings = Store.open(store_url, artifacts=artifacts), RunSettings(device, resume)

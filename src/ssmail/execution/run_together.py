@@ -15,6 +15,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Kind, RunSettings
+from ssmail.execution.devices import also_on
 from ssmail.execution.planning import Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
 from ssmail.store.checkpoint_files import BEST, LAST, LASTS
@@ -124,7 +125,8 @@ def _open_run(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
     remark = _load_last(store, plan.row.id, loop)
-    return store.resume_run(plan.row.id, loop.epoch, claim), remark
+    device = also_on(plan.row.device, settings.device) if loop.epoch else settings.device
+    return store.resume_run(plan.row.id, loop.epoch, claim, device=device), remark
 
 
 def _load_last(store: Store, run_id: str, loop: Loop) -> str:

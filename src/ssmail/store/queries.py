@@ -66,6 +66,11 @@ class RunRow:
         return self.spec_hash, self.seed, self.dataset_hash
 
     @property
+    def deterministic(self) -> bool:
+        """Whether the same code on the same machine computes the same numbers: on a CPU alone, not on a GPU."""
+        return self.device == "cpu"
+
+    @property
     def code(self) -> str:
         """The code that computed the run: "0.1.0+COMMIT", with "-dirty" where the tree was changed."""
         commit = f"+{self.git_commit}" if self.git_commit else ""
