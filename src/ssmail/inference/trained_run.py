@@ -146,20 +146,28 @@ class TrainedRun:
         return positions.reshape(samples, len(states), *positions.shape[1:])
 
 
-def load_run(run: str, db: str | Path, *, model: Model = "best", data: str | Path | None = None) -> TrainedRun:
+def load_run(
+    run: str,
+    db: str | Path,
+    *,
+    model: Model = "best",
+    data: str | Path | None = None,
+    artifacts: str | None = None,
+) -> TrainedRun:
     """Load the trained model of a run.
 
     run: the id of a run, or its first digits. db: the database, a path or an SQLAlchemy URL, with its checkpoints
-    beside it, or in the place that SSMAIL_ARTIFACTS names. model: the one with the smallest validation error, or that
-    of the last epoch. data: the expert set that the run was trained on; only needed for runs of ssmail 0.1 and earlier
-    on data from a file, which did not store their scaling.
+    beside it. model: the one with the smallest validation error, or that of the last epoch. data: the expert set that
+    the run was trained on; only needed for runs of ssmail 0.1 and earlier on data from a file, which did not store
+    their scaling. artifacts: the folder or URL where training kept the checkpoints, by default that of SSMAIL_ARTIFACTS
+    if it is set.
 
     Nothing that the database names is run, imported or opened, except the run's checkpoints in these two places.
     Raises InputError if there is no such run, or if it has no such model.
     """
     if as_url(db).get_backend_name() == "sqlite":
         existing(db)  # opening it would create it
-    store = Store.open(db)
+    store = Store.open(db, artifacts=artifacts)
     try:
         return load_from(store, run, model=model, data=data)
     finally:

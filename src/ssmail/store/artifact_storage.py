@@ -196,7 +196,9 @@ class _Remote:
             raise InputError(f"no driver for the URL {shown} is installed; run `pip install {package}`") from error
         except Exception as error:
             reason = shortened(masked(str(error)), 120)
-            raise InputError(f"{shown} is no URL that fsspec can use ({reason}); give another --artifacts") from error
+            raise InputError(
+                f"{shown} cannot be used for artifacts ({reason}); check it, or give another URL"
+            ) from error
         self._root = str(root).rstrip("/")
         self._made: set[str] = set()
 

@@ -4,6 +4,7 @@ import uuid
 from collections.abc import Iterable, Sequence
 from copy import copy
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -30,16 +31,13 @@ class Store:
     """An open database of runs. Many processes may use the same database at once; each opens its own Store.
 
     url: opens the same database again, in any process. where: its path, or its URL without the password, for messages.
-    checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. storage: where the
-    checkpoints are instead, if the user named a place. stale_seconds: a running run whose last heartbeat is further
-    from now than this counts as dead. damaged: the damaged rows that were met so far, and left out.
+    checkpoint_root: the folder with one subfolder of checkpoints per run id, beside an SQLite file. stale_seconds: a
+    running run whose last heartbeat is further from now than this counts as dead. damaged: the damaged rows that were
+    met so far, and left out.
     """
 
-    def __init__(
-        self, engine: Engine, stale_seconds: float = STALE_SECONDS, storage: ArtifactStorage | None = None
-    ) -> None:
-        self._engine = engine
-        self.storage = storage
+    def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS, artifacts: str | None = None) -> None:
+        self._engine, self._artifacts = engine, artifacts
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
         self.stale_seconds = stale_seconds
@@ -63,8 +61,12 @@ class Store:
         Raises InputError when a place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
         stale = queries.chosen_stale_seconds() if stale_seconds is None else stale_seconds
-        storage = storage_of(artifacts)
-        return cls(connect(where, patience), stale, storage)
+        return cls(connect(where, patience), stale, artifacts)
+
+    @cached_property
+    def storage(self) -> ArtifactStorage | None:  # made late: most commands read no checkpoint, and need no driver
+        """Where checkpoints are instead of the folder. Raises InputError for a place that cannot be used."""
+        return storage_of(self._artifacts)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
