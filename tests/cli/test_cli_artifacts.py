@@ -1,10 +1,12 @@
 """--artifacts, and SSMAIL_ARTIFACTS instead of it, from training to deletion."""
 
 import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from fsspec.registry import _registry
 
 from ssmail.store import Store
 from tests.cli.command_line import CommandLine
@@ -71,7 +73,8 @@ def test_an_unusable_place_is_a_sentence_and_changes_nothing(
 
 
 def test_a_driver_that_is_not_installed(cli: CommandLine, db: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "s3fs", None)
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(_registry, "s3", raising=False)
     sentence = cli(*TRAIN, "--artifacts", "s3://bucket/runs", "--db", db).sentence
     assert sentence == "no driver for the URL s3://bucket/runs is installed; run `pip install s3fs`"
     assert not db.parent.exists()

@@ -3,12 +3,14 @@
 import errno
 import hashlib
 import os
+import sys
 import uuid
 from pathlib import Path
 from typing import Any
 
 import fsspec
 import pytest
+from fsspec.registry import _registry
 
 from ssmail.errors import InputError, SsmailError
 from ssmail.store import ArtifactRow, RunState, RunWriter, Store
@@ -159,7 +161,8 @@ def test_unusable_places_are_a_sentence_without_the_password(place: str, message
 
 
 def test_a_missing_driver_is_named_with_its_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "s3fs", None)
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    monkeypatch.delitem(_registry, "s3", raising=False)
     with pytest.raises(InputError, match=r"no driver for the URL s3://bucket/x is installed; run `pip install s3fs`"):
         ArtifactStorage("s3://bucket/x")
 
