@@ -102,8 +102,7 @@ def report(count: int, of_slurm: int) -> None:
     """Print a line for each launcher."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        url = Store.open(folder / "ssmail.db").url
-        jobs = [job_text([], url, "cpu", 1)] * count
+        jobs = [job_text([], Store.open(folder / "ssmail.db"), "cpu", 1, 1)] * count
         for launcher, number, measure in (
             ("a plain process pool", count, lambda: seconds(lambda: plain_pool(jobs))),
             ("local", count, lambda: seconds(lambda: local(count, folder))),

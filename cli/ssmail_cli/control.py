@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import InputError, command_line
 from ssmail.execution import LauncherName, Resume
 from ssmail_cli import completion, launching, options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.launching import Launch
 from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import chosen_format, note, print_rows
@@ -36,11 +37,13 @@ def control(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     launcher: launching.Name = LauncherName.LOCAL,
     launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train controls: experiments that switch off what a claim's verdict is credited to, arm by arm.
@@ -66,7 +69,8 @@ def control(
     if enqueue_only:
         enqueue(sweep, db, resume, launcher, as_json)
         return
-    rows = train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json)
+    launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
+    rows = train_sweep(sweep, db, launch, as_json, artifacts)
     if sys.stdout.isatty() and not is_interrupted(rows):
         command = command_line("ssmail", "plot", "control", *chosen, *options.database_words(db))
         note(f"`{command}` draws these runs")

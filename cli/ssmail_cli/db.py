@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError, stored_values
 from ssmail.plots.formatting import counted
 from ssmail_cli import options
+from ssmail_cli.artifacts import Artifacts, ArtifactsGiven
 from ssmail_cli.command_group import Commands
 from ssmail_cli.output import Format, chosen_format, note, print_rows, print_table, say, write_json
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from ssmail.store.maintenance.compact import Compact
     from ssmail.store.maintenance.merge import Merge
     from ssmail.store.maintenance.run_rows import Difference
-    from ssmail.store.maintenance.sqlite_file import DatabaseInformation
+    from ssmail.store.maintenance.whole_databases import DatabaseInformation
 
 
 class DatabaseGroup(Commands):
@@ -43,7 +44,7 @@ def info(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE)
     Prints the revision of its schema, its size, the share of the arrays, and the number of runs by environment, method,
     profile and state. Does not upgrade it.
     """
-    from ssmail.store.maintenance.sqlite_file import describe_contents
+    from ssmail.store.maintenance.whole_databases import describe_contents
 
     found = describe_contents(db)
     kind = chosen_format(as_json, None)
@@ -65,7 +66,7 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
     First writes a backup: of a file beside it, of a server's database into results/. All other commands also upgrade an
     older database when they open it, but without a backup.
     """
-    from ssmail.store.maintenance.sqlite_file import upgrade as upgrade_database
+    from ssmail.store.maintenance.whole_databases import upgrade as upgrade_database
 
     done = upgrade_database(db)
     if as_json:
@@ -78,7 +79,11 @@ def upgrade(as_json: Json = False, db: options.Database = options.DEFAULT_DATABA
 
 
 @app.command()
-def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE) -> None:
+def check(
+    as_json: Json = False,
+    artifacts: ArtifactsGiven = None,
+    db: options.Database = options.DEFAULT_DATABASE,
+) -> None:
     """Look for problems in the database and its checkpoints.
 
     Prints one line for each problem, with its remedy, and changes nothing. Reads the whole file and all checkpoints;
@@ -86,7 +91,7 @@ def check(as_json: Json = False, db: options.Database = options.DEFAULT_DATABASE
     """
     from ssmail.store.maintenance.checks import check as check_database
 
-    problems = check_database(db)
+    problems = check_database(db, artifacts)
     if as_json:
         write_json([asdict(problem) for problem in problems], None)
     for problem in problems if not as_json else ():
@@ -107,7 +112,7 @@ def backup(
     That of a server is written by pg_dump, for pg_restore. Safe while runs are being computed. Checkpoints, which are
     separate files, are not copied.
     """
-    from ssmail.store.maintenance.sqlite_file import back_up
+    from ssmail.store.maintenance.whole_databases import back_up
 
     size = back_up(db, file)
     if as_json:
@@ -123,6 +128,7 @@ def merge(
         typer.Argument(metavar="OTHER.db", help="The file or URL of the database to take runs from; it is only read."),
     ],
     as_json: Json = False,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Add the runs of another database to this one.
@@ -133,7 +139,7 @@ def merge(
     """
     from ssmail.store.maintenance.merge import merge as merge_databases
 
-    done = merge_databases(db, other)
+    done = merge_databases(db, other, artifacts)
     if as_json:
         runs = [{"run": item.run.id, "fate": item.fate.value, "replaces": item.replaces} for item in done.runs]
         differences = [asdict(difference) for difference in done.differences]
@@ -173,7 +179,7 @@ def export(
     from ssmail.paper.reads import contents
     from ssmail.store import Store
     from ssmail.store.maintenance.compact import export_compact, settled_cells
-    from ssmail.store.maintenance.sqlite_file import existing, require_current
+    from ssmail.store.maintenance.whole_databases import existing, require_current
 
     if not compact:
         raise InputError(

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 import typer
 
 from ssmail_cli import options
+from ssmail_cli.artifacts import ArtifactsGiven
 from ssmail_cli.output import note, say, write_json
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def forecast(
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
     as_json: options.Json = False,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Sample the futures of observed agents with the trained model of a run.
@@ -60,7 +62,7 @@ def forecast(
     from ssmail.inference.windows import read_windows
 
     forecasts.check_output(out, force=force)
-    trained = load_from(options.open_store(db), run, model=cast("Model", model), data=expert_set)
+    trained = load_from(options.open_store(db, artifacts=artifacts), run, model=cast("Model", model), data=expert_set)
     windows = read_windows(data, trained, observed)
     found = forecasts.forecast(trained, windows, steps, samples, seed)
     rows = forecasts.write(found, out, force=force)
@@ -88,6 +90,7 @@ def export_model(
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Write into a folder that is not empty.")] = False,
     as_json: options.Json = False,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Export the trained model of a run for use without ssmail.
@@ -98,7 +101,7 @@ def export_model(
     from ssmail.inference.model_export import export
     from ssmail.inference.trained_run import load_from
 
-    trained = load_from(options.open_store(db), run, model=cast("Model", model), data=expert_set)
+    trained = load_from(options.open_store(db, artifacts=artifacts), run, model=cast("Model", model), data=expert_set)
     files = export(trained, out, agents=agents, batch=batch, onnx=onnx, force=force)
     if as_json:
         write_json({"path": out, "run": trained.id, "model": trained.model, "files": files}, None)

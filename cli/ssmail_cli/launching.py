@@ -37,24 +37,31 @@ Settings = Annotated[
 
 @dataclass(frozen=True)
 class Launch:
-    """Where and how a sweep is computed: --launcher, its settings, --jobs, --resume and --device."""
+    """Where and how a sweep is computed: --launcher, its settings, --jobs, --resume, --device and --per-device."""
 
     jobs: int = 1
     resume: Resume = Resume.AUTO
     device: str = "cpu"
+    per_device: int = 1
     launcher: LauncherName = LauncherName.LOCAL
     settings: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(
-        cls, jobs: int, resume: Resume, device: str, launcher: LauncherName, texts: Sequence[str] | None
+        cls,
+        jobs: int,
+        resume: Resume,
+        device: str,
+        per_device: int,
+        launcher: LauncherName,
+        texts: Sequence[str] | None,
     ) -> "Launch":
         """Return what the options say. Raises InputError where they do not fit each other, or this machine."""
         settings = parse_settings(texts or ())
         if launcher is LauncherName.LOCAL:
             if settings:
                 raise InputError("--launcher-set is for --launcher slurm and --launcher ray; leave it out.")
-            return cls(jobs, resume, pick_device(device))
+            return cls(jobs, resume, pick_device(device), per_device)
         if resume is Resume.NEVER:
             raise InputError(
                 f"--launcher {launcher} is for --resume auto or require, not never, because a job that is requeued "
@@ -63,10 +70,11 @@ class Launch:
         from ssmail.execution.launched_sweep import check_settings
 
         check_settings(launcher, settings)
-        return cls(jobs, resume, device, launcher, settings)  # the device is that of a node
+        return cls(jobs, resume, device, per_device, launcher, settings)  # the device is that of a node
 
     def compute(self, store: "Store", cells: "Sequence[Cell]", report: Report) -> "list[Event]":
         """Compute the cells, and return their final events in the same order."""
+        artifacts = store.storage.place if store.storage else None
         if self.launcher is LauncherName.LOCAL:
             from ssmail.execution.local import run_cells
 
@@ -74,7 +82,9 @@ class Launch:
                 cells,
                 store_url=store.url,
                 jobs=self.jobs,
+                artifacts=artifacts,
                 device=self.device,
+                per_device=self.per_device,
                 resume=self.resume,
                 on_event=report,
             )
@@ -88,7 +98,9 @@ class Launch:
                 launcher=launcher,
                 on_event=report,
                 grouping=grouping,
+                artifacts=artifacts,
                 device=self.device,
+                per_device=self.per_device,
                 resume=self.resume,
             )
         finally:

@@ -89,6 +89,8 @@ Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
 ]
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, with NaN and infinities as text.")]
 Output = Annotated[
     Format | None,
@@ -185,9 +187,12 @@ DeviceOption = Annotated[
         "--device",
         metavar="DEVICE",
         callback=_known_device,
-        help="auto (a GPU when there is one), cpu, cuda, or cuda:1 for the second GPU.",
+        help="auto (the GPUs, if there are any), cpu, cuda (the GPUs), or cuda:1 for the second GPU.",
         autocompletion=lambda: list(DEVICES),
     ),
+]
+PerDevice = Annotated[
+    int, typer.Option("--per-device", min=1, help="Processes that use a GPU at the same time; --jobs is for all.")
 ]
 Enqueue = Annotated[
     bool, typer.Option("--enqueue", help="Put the runs into the queue of the database for `ssmail worker`, and end.")
@@ -236,6 +241,7 @@ def open_store(
     database: str,
     made_by: str = "ssmail train --method ssail --profile quick --seeds 0-4",
     mark_dead: bool = True,
+    artifacts: str | None = None,
 ) -> "Store":
     """Open the store for reading, after marking runs whose process has died as interrupted, where possible.
 
@@ -245,7 +251,7 @@ def open_store(
 
     if is_missing(database):
         raise InputError(f"there is no database {database}; `{made_by}` makes one, or name another with --db.")
-    store = noting_damage(Store.open(database))
+    store = noting_damage(Store.open(database, artifacts=artifacts))
     if mark_dead and not all(store.is_alive(row) for row in store.runs(state="running")):
         with suppress(SsmailError):
             store.mark_stale()

@@ -223,7 +223,7 @@ def _headline(event: "Event") -> str:
     error = event.metrics.get(environment_metrics(event.cell.spec.environment).error)
     words = {
         "started": f"started{run}",
-        "resumed": f"resumed after epoch {event.epoch}{run}",
+        "resumed": f"resumed after epoch {event.epoch}{run}" + (f": {event.message}" if event.message else ""),
         "skipped": f"skipped: {event.message}",
         "elsewhere": event.message,
         "finished": f"finished{run}" + ("" if error is None else f": test error {error:.4g}"),

@@ -13,6 +13,7 @@ from ssmail.execution import LauncherName, Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import duration
 from ssmail_cli import completion, launching, options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.datasets import prep_mocap
 from ssmail_cli.launching import Launch
 from ssmail_cli.options import is_missing, noting_damage, parse_seeds
@@ -65,6 +66,7 @@ def reproduce(
     seeds: SeedsOfProfile = None,
     jobs: options.Jobs = 2,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     launcher: launching.Name = LauncherName.LOCAL,
     launcher_set: launching.Settings = None,
     cmu: CmuDir = None,
@@ -74,6 +76,7 @@ def reproduce(
     out: options.OutDir = options.DEFAULT_OUT,
     formats: options.Formats = options.DEFAULT_FORMATS,
     stat: options.StatOfFigures = None,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train what the figures and claims of the paper need, draw the figures, and write the report.
@@ -101,8 +104,8 @@ def reproduce(
     if enqueue_only:
         enqueue(_prepare(figures, data, cmu, db), db, Resume.AUTO, launcher, as_json)
         return
-    launch = Launch.of(jobs, Resume.AUTO, device, launcher, launcher_set)
-    store, sweep, rows = _train(figures, data, cmu, db, launch)
+    launch = Launch.of(jobs, Resume.AUTO, device, per_device, launcher, launcher_set)
+    store, sweep, rows = _train(figures, data, cmu, db, launch, artifacts)
     runs = _settled_runs(store, figures, data, sweep, rows)
     drawn = [
         _draw(store, name, cells, runs, data.missing.get(name), statistic, out, formats)
@@ -221,13 +224,13 @@ def _prepare(figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: st
 
 
 def _train(
-    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, launch: Launch
+    figures: Mapping[str, Sweep], data: _Data, cmu: Path | None, db: str, launch: Launch, artifacts: str | None
 ) -> "tuple[Store, Sweep, Rows]":
     """Make the data and compute every cell, as _prepare has them. Raises typer.Exit when interrupted, too."""
     from ssmail.store import Store
 
     sweep = _prepare(figures, data, cmu, db)
-    store = noting_damage(Store.open(db))
+    store = noting_damage(Store.open(db, artifacts=artifacts))
     rows = result_rows(store, sweep, compute(store, sweep, launch))
     if is_interrupted(rows):
         finish(sweep, rows)

@@ -99,7 +99,7 @@ def key_metrics(environments: Iterable[str]) -> dict[str, str | None]:
 
 def run_row(run: "RunRow") -> dict[str, Any]:
     """Return the columns of a stored run by name, without its spec and its owner; `settings` and `changes` tell how the
-    spec differs from the profile.
+    spec differs from the profile, `deterministic` whether the device gives the same numbers each time.
     """
     row: dict[str, Any] = {}
     for item in fields(run):
@@ -107,6 +107,8 @@ def run_row(run: "RunRow") -> dict[str, Any]:
             row[item.name] = getattr(run, item.name)
         if item.name == "profile":
             row |= {"settings": run.settings, "changes": run.changes}
+        if item.name == "device":
+            row["deterministic"] = run.deterministic
     return row
 
 

@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError, unknown_name
 from ssmail.plots.formatting import counted
 from ssmail_cli import comparison_tables, completion, options
+from ssmail_cli.artifacts import ArtifactsGiven
 from ssmail_cli.command_group import Commands
 from ssmail_cli.output import (
     Format,
@@ -238,16 +239,19 @@ def delete(
         typer.Argument(metavar="RUN", help="Ids of runs, or their first digits.", autocompletion=completion.run_ids),
     ],
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Delete without asking.")] = False,
+    artifacts: ArtifactsGiven = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Delete runs and their checkpoints.
 
-    Refuses to delete a run that is being computed.
+    Refuses to delete a run that is being computed. A copy of the run in another database has the same checkpoints in
+    --artifacts, and loses them.
     """
     import sys
 
-    store = options.open_store(db)
+    store = options.open_store(db, artifacts=artifacts)
     full = store.full_ids(ids)
+    left = store.storage is None and any(item.by_content for run_id in full for item in store.artifacts(run_id))
     known = {run.id: f"{run.method}, seed {run.seed}, {run.state}" for run in store.runs()}
     names = ", ".join(f"{run_id[:8]} ({known.get(run_id, 'damaged')})" for run_id in full)
     if not yes:
@@ -258,6 +262,8 @@ def delete(
             raise typer.Exit(ExitCode.FAILURE)
     store.delete(full)
     note(f"deleted {names}")
+    if left:
+        note("their checkpoints stay where --artifacts put them, unless --artifacts is given here too")
 
 
 def _order(sort: str | None, descending: bool) -> tuple[str | None, bool]:
@@ -313,13 +319,20 @@ def _values(metrics: "DataFrame") -> list[dict[Any, Any]]:
 
 
 def _details(store: "Store", run: "RunRow") -> dict[str, Any]:
+    from ssmail.store.artifact_storage import place_of
+
     return {
         "run": run_row(run),
         "spec": run.spec,
         "metrics": _values(store.latest_metrics([run.id])),
         "arrays": store.array_names(run.id),
         "artifacts": [
-            {"name": item.name, "path": item.path, "sha256": item.sha256, "size_bytes": item.size_bytes}
+            {
+                "name": item.name,
+                "path": place_of(item, store.storage),
+                "sha256": item.sha256,
+                "size_bytes": item.size_bytes,
+            }
             for item in store.artifacts(run.id)
         ],
     }

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 Rows = list[dict[str, Any]]
 
 
-def train_sweep(sweep: Sweep, db: str, launch: Launch, as_json: bool) -> Rows:
+def train_sweep(sweep: Sweep, db: str, launch: Launch, as_json: bool, artifacts: str | None) -> Rows:
     """Compute every cell into the store, print a row for each, and return the rows."""
     from ssmail.execution.planning import check_labels
     from ssmail.store import Store
 
     check_labels(sweep)  # before there is a database
-    store = noting_damage(Store.open(db))
+    store = noting_damage(Store.open(db, artifacts=artifacts))
     announce(store, sweep, launch)
     rows = result_rows(store, sweep, compute(store, sweep, launch))
     print_results(rows, sweep, chosen_format(as_json, None))

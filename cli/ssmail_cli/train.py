@@ -15,6 +15,7 @@ from ssmail.execution import LauncherName, Resume
 from ssmail.paper.results import FIGURES
 from ssmail.plots.formatting import counted
 from ssmail_cli import completion, launching, options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.launching import Launch
 from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import note
@@ -46,11 +47,13 @@ def train(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     launcher: launching.Name = LauncherName.LOCAL,
     launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train methods with one or several seeds.
@@ -77,7 +80,8 @@ def train(
     if enqueue_only:
         enqueue(sweep, db, resume, launcher, as_json)
         return
-    finish(sweep, train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json))
+    launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
+    finish(sweep, train_sweep(sweep, db, launch, as_json, artifacts))
 
 
 def ablate(
@@ -115,11 +119,13 @@ def ablate(
     settings: options.Settings = None,
     resume: options.ResumeOption = Resume.AUTO,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     launcher: launching.Name = LauncherName.LOCAL,
     launcher_set: launching.Settings = None,
     enqueue_only: options.Enqueue = False,
     dry_run: options.DryRun = False,
     as_json: options.Json = False,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Train a method for several values of one key of its spec, or for a grid of values of several keys.
@@ -146,7 +152,8 @@ def ablate(
     if enqueue_only:
         enqueue(sweep, db, resume, launcher, as_json)
         return
-    rows = train_sweep(sweep, db, Launch.of(jobs, resume, device, launcher, launcher_set), as_json)
+    launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
+    rows = train_sweep(sweep, db, launch, as_json, artifacts)
     if sys.stdout.isatty() and not is_interrupted(rows):
         _point_to_figures(names, grid.keys, next(iter(grid.specs.values())), db)
     finish(sweep, rows)

@@ -9,6 +9,7 @@ import typer
 from ssmail.errors import ExitCode, InputError
 from ssmail.plots.formatting import counted, duration
 from ssmail_cli import options
+from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.options import open_store, pick_device
 from ssmail_cli.output import chosen_format, note, print_rows
 
@@ -54,6 +55,7 @@ def worker(
     ] = None,
     jobs: options.Jobs = 1,
     device: options.DeviceOption = options.AUTO,
+    per_device: options.PerDevice = 1,
     data: Annotated[
         list[Path] | None,
         typer.Option(
@@ -61,6 +63,7 @@ def worker(
         ),
     ] = None,
     as_json: options.Json = False,
+    artifacts: Artifacts = None,
     db: options.Database = options.DEFAULT_DATABASE,
 ) -> None:
     """Compute the runs that wait in the queue of the database.
@@ -77,10 +80,11 @@ def worker(
     for name, value in (("--max-hours", max_hours), ("--idle-exit", idle_exit)):
         if value is not None and not 0 <= value < math.inf:
             raise InputError(f"{name} takes a number that is not negative, not {value}.")
-    store = open_store(db, MADE_BY, mark_dead=False)  # what is dead is shown, or taken over, as such
+    store = open_store(db, MADE_BY, mark_dead=False, artifacts=artifacts)  # what is dead is taken over as such
     source = QueueSource(store, max_cells, max_hours, idle_exit, data or ())
-    chosen = pick_device(device)
-    events, stopped = run_waiting(source, store=store, on_event=worker_log(), jobs=jobs, device=chosen)
+    events, stopped = run_waiting(
+        source, store=store, on_event=worker_log(), jobs=jobs, device=pick_device(device), per_device=per_device
+    )
     sweep = {event.cell: describe(event.cell) for event in events}
     rows = result_rows(store, sweep, events)
     if rows:

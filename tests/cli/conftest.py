@@ -16,7 +16,7 @@ from tests.execution.fake_loop import Walk
 from tests.execution.one_cell import run_cell
 from tests.paper.handmade_arrays import arrays
 
-SETTINGS = ("SSMAIL_DB", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
+SETTINGS = ("SSMAIL_DB", "SSMAIL_ARTIFACTS", "SSMAIL_EXPERIMENTS", "SSMAIL_DEBUG")
 
 
 @pytest.fixture(autouse=True)
@@ -69,9 +69,17 @@ def walk(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """walk() lets cells be planned, resumed and stored as always, but in this process and by random walks."""
 
     def run_cells(
-        cells: Sequence[Cell], *, store_url: str, on_event: Report, jobs: int, device: str, resume: Resume
+        cells: Sequence[Cell],
+        *,
+        store_url: str,
+        on_event: Report,
+        jobs: int,
+        device: str,
+        resume: Resume,
+        per_device: int,
+        artifacts: str | None,
     ) -> list[Event]:
-        store, settings = Store.open(store_url), RunSettings(device, resume)
+        store, settings = Store.open(store_url, artifacts=artifacts), RunSettings(device, resume)
         events = []
         for cell in cells:
             events.append(run_cell(cell, store, settings, on_event, lambda: False, Walk))

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from ssmail.store import Store
-from ssmail.training.checkpoint import load_checkpoint
+from ssmail.store.recorded_checkpoints import load_recorded
 
 CLOCKS = ("seconds",)  # the metrics that measure time
 
@@ -16,7 +16,8 @@ def recorded(store: Store, run_id: str) -> tuple[dict[tuple[str, int], str], dic
     rows = zip(frame["name"], frame["step"], frame["value"], strict=True)
     metrics = {(name, step): repr(value) for name, step, value in rows if name not in CLOCKS}
     arrays = {name: plain(torch.as_tensor(store.array(run_id, name))) for name in store.array_names(run_id)}
-    return metrics, arrays, {row.name: plain(load_checkpoint(row.path)) for row in store.artifacts(run_id)}
+    states = {row.name: load_recorded(store, run_id, row.name)[1] for row in store.artifacts(run_id)}
+    return metrics, arrays, {name: plain(state) for name, state in states.items()}
 
 
 def plain(state: Any) -> Any:

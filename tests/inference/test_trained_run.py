@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import ssmail
 from ssmail.errors import InputError
 from ssmail.inference.trained_run import TrainedRun, load_run
+from ssmail.store.artifact_storage import ArtifactStorage
 from ssmail.training.batches import to_numpy
 from ssmail.training.checkpoint import UnfitState, load_checkpoint, save_checkpoint
 from ssmail.training.learner import Predictor
@@ -179,6 +180,23 @@ def test_a_new_checkpoint_needs_no_file(train: Train, tmp_path: Path) -> None:
         load_run(trained.id, db).rollout(observed_of(trained, 6), 4),
         load_run(trained.id, trained.db).rollout(observed_of(trained, 6), 4),
     )
+
+
+def test_a_checkpoint_in_a_shared_place_is_found_where_the_user_says(
+    train: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trained, place = train("ssail"), f"memory://{tmp_path.name}"
+    shutil.copy(trained.db, tmp_path / "alone.db")
+    for file in (trained.db.parent / "checkpoints" / trained.id).iterdir():
+        ArtifactStorage(place).put(trained.id, file.read_bytes())
+    expected = load_run(trained.id, trained.db).rollout(WALK, 5)
+    np.testing.assert_array_equal(
+        load_run(trained.id, tmp_path / "alone.db", artifacts=place).rollout(WALK, 5), expected
+    )
+    with pytest.raises(InputError, match="give the place that it was trained with as --artifacts"):
+        load_run(trained.id, tmp_path / "alone.db")
+    monkeypatch.setenv("SSMAIL_ARTIFACTS", place)
+    np.testing.assert_array_equal(load_run(trained.id, tmp_path / "alone.db").rollout(WALK, 5), expected)
 
 
 def larger(state: dict[str, Any], section: str, key: str, value: object) -> None:

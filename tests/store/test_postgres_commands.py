@@ -12,7 +12,7 @@ from sqlalchemy import make_url
 
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store, connection
-from ssmail.store.maintenance import postgres, sqlite_file
+from ssmail.store.maintenance import postgres, whole_databases
 from ssmail.store.maintenance.checks import check
 from ssmail.store.maintenance.merge import Fate, merge
 from ssmail_cli.main import run
@@ -150,10 +150,10 @@ def test_a_backup_that_pg_dump_refuses_is_one_sentence(url: str, call: Call, mon
 def test_an_upgrade_leaves_a_backup(url: str, call: Call, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     Store.open(url).close()
     assert "already has the newest schema" in call("db", "upgrade", "--db", url)[1]
-    monkeypatch.setattr(sqlite_file, "connect", lambda _: Store.open(tmp_path / "x.db")._engine)
-    for module in (connection, sqlite_file):
+    monkeypatch.setattr(whole_databases, "connect", lambda _: Store.open(tmp_path / "x.db")._engine)
+    for module in (connection, whole_databases):
         monkeypatch.setattr(module, "REVISIONS", ("0001", "0002"))
-    done = sqlite_file.upgrade(url)
+    done = whole_databases.upgrade(url)
     assert (done.before, done.after) == ("0001", "0002")
     assert done.backup is not None
     assert done.backup.parent == tmp_path / "results"

@@ -66,11 +66,15 @@ class Event:
 
 @dataclass(frozen=True)
 class RunSettings:
-    """How to compute a cell. Plain values, so that they can be sent to another process as JSON."""
+    """How to compute a cell. Plain values, so that they can be sent to another process as JSON.
+
+    artifacts: a folder or URL for checkpoints, which may hold a password; None: that of SSMAIL_ARTIFACTS, if it is set.
+    """
 
     device: str = "cpu"
     resume: Resume = Resume.AUTO
     heartbeat_seconds: float = HEARTBEAT_SECONDS
+    artifacts: str | None = None
 
 
 @dataclass(frozen=True)

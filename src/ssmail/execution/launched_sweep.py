@@ -86,7 +86,9 @@ def launch_cells(
     launcher: Launcher,
     on_event: Callable[[Event], None],
     grouping: Grouping = SINGLE,
+    artifacts: str | None = None,
     device: str = "cpu",
+    per_device: int = 1,
     resume: Resume = Resume.AUTO,
 ) -> list[Event]:
     """Compute every cell in jobs of the launcher, and return the final event of each, in the order of `cells`.
@@ -100,10 +102,10 @@ def launch_cells(
     if resume is Resume.NEVER:
         raise InputError("a launcher is for --resume auto or require, not never: a job that is requeued resumes")
     check_labels(cells)
-    store = Store.open(store_url, patience=BUSY_SECONDS)
+    store = Store.open(store_url, patience=BUSY_SECONDS, artifacts=artifacts)
     try:
         plans = {cell: plan_cell(store, cell, resume) for cell in cells}
-        sweep = _Sweep(store, launcher, grouping, device, on_event)
+        sweep = _Sweep(store, launcher, grouping, (device, per_device), on_event)
         with counted_signals(sweep):
             sweep.run(plans)
         return [sweep.results[cell] for cell in cells]
@@ -133,7 +135,12 @@ class _Sweep:
     """The cells of a sweep, the jobs that compute them, and what is known of their runs."""
 
     def __init__(
-        self, store: Store, launcher: Launcher, grouping: Grouping, device: str, on_event: Callable[[Event], None]
+        self,
+        store: Store,
+        launcher: Launcher,
+        grouping: Grouping,
+        device: tuple[str, int],
+        on_event: Callable[[Event], None],
     ) -> None:
         self.results: dict[Cell, Event] = {}
         self.stop_signals = 0
@@ -182,7 +189,7 @@ class _Sweep:
     def _submit(self, cells: Sequence[Cell]) -> None:
         size, processes = self._grouping
         groups = [list(cells[first : first + size]) for first in range(0, len(cells), size)]
-        texts = [job_text(group, self._store.url, self._device, processes) for group in groups]
+        texts = [job_text(group, self._store, *self._device, processes) for group in groups]
         if texts:
             self._jobs |= dict(zip(self._launcher.submit(texts), groups, strict=True))
 

@@ -16,6 +16,7 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, sentence, shortened
 from ssmail.execution.cells import Cell, Event
 from ssmail.execution.local import run_cells
+from ssmail.store import Store
 
 _PASSED_ON = ("SSMAIL_STALE_SECONDS", "SSMAIL_EXPERIMENTS")  # to the node, where its own environment does not have them
 Unended = Literal["failed", "interrupted"]
@@ -52,13 +53,15 @@ class Launcher(Protocol):
         """Leave the cluster."""
 
 
-def job_text(cells: Sequence[Cell], store_url: str, device: str, processes: int) -> str:
+def job_text(cells: Sequence[Cell], store: Store, device: str, per_device: int, processes: int) -> str:
     """Return the job that computes these cells, in so many processes at a time, as `compute` reads it."""
     return json.dumps(
         {
             "cells": [[json.loads(cell.spec.as_json()), cell.seed] for cell in cells],
-            "store_url": store_url,
+            "store_url": store.url,
+            "artifacts": store.storage.place if store.storage else None,
             "device": device,
+            "per_device": per_device,
             "processes": processes,
             "folder": str(Path.cwd()),
             "environment": {name: os.environ[name] for name in _PASSED_ON if name in os.environ},
@@ -78,9 +81,8 @@ def compute(text: str) -> str:
     os.environ.update(job["environment"])
     cells = [Cell(RunSpec.model_validate(spec), seed) for spec, seed in job["cells"]]
     try:
-        events = run_cells(
-            cells, store_url=job["store_url"], jobs=job["processes"], device=job["device"], on_event=_log
-        )
+        given = {name: job[name] for name in ("store_url", "artifacts", "device", "per_device")}
+        events = run_cells(cells, jobs=job["processes"], on_event=_log, **given)
     except SsmailError as error:
         bad_input = isinstance(error, InputError)
         events = [_failed(cell, sentence(str(error)), bad_input) for cell in cells]

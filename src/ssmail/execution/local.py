@@ -3,6 +3,7 @@
 Seeds of one spec whose method can train them together share a process, which takes a fraction of the time.
 """
 
+import logging
 import os
 import selectors
 import signal
@@ -18,7 +19,8 @@ from typing import Any, Protocol
 
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
-from ssmail.execution.cells import NO_LONGER_STORED, Cell, Event, Job, Kind, RunSettings
+from ssmail.execution.cells import AUTO, NO_LONGER_STORED, Cell, Event, Job, Kind, RunSettings
+from ssmail.execution.devices import least_used, places
 from ssmail.execution.planning import check_labels, plan_cell
 from ssmail.execution.sources import QueueSource, Source, SweepSource
 from ssmail.store import HEARTBEAT_SECONDS, RunRow, RunState, Store
@@ -26,6 +28,7 @@ from ssmail.store.queue import Claim
 
 WORKER = (sys.executable, "-P", "-m", "ssmail.execution.worker")
 """The command that starts a worker process. Tests replace it to compute cells with a training loop of their own."""
+_LOG = logging.getLogger(__name__)
 _POLL_SECONDS = 0.2
 _ONE_THREAD = {"OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 # By default glibc returns large freed blocks to the system, which has to provide and clear them again at the next step;
@@ -40,7 +43,9 @@ def run_cells(
     on_event: Callable[[Event], None],
     jobs: int = 1,
     device: str = "cpu",
+    per_device: int = 1,
     resume: Resume = Resume.AUTO,
+    artifacts: str | None = None,
     worker: Sequence[str] = WORKER,
 ) -> list[Event]:
     """Compute every cell in at most `jobs` processes, and return the final event of each, in the order of `cells`.
@@ -49,18 +54,25 @@ def run_cells(
     called in this process with every event, including final ones. Any number of processes may be given the same cells:
     each is computed once, by the process that claims it first, and is skipped in the others once it has ended; a cell
     whose process stops or dies is taken over. A failing cell does not affect the others; a process that dies ends all
-    its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell
-    finishes its epoch and is marked interrupted; a second signal kills the workers, which loses only their current
-    epoch. Raises InputError, and computes nothing, when `resume` is NEVER and another process is computing one of the
-    cells, when it is REQUIRE and there is nothing to resume, when a label function is broken, or when the first cell
-    cannot start because of its input.
+    its cells, which can be resumed. After SIGINT or SIGTERM to this process, every running cell finishes its epoch and
+    is marked interrupted; a second signal kills the workers, which loses only their current epoch.
+
+    device: see `devices.places`; of the processes at most `per_device` use a GPU at the same time, so there may be
+    fewer than `jobs`. artifacts: a folder or URL for checkpoints (see `Store.open`).
+
+    Raises InputError, and computes nothing, when `artifacts` cannot be written to, when `resume` is NEVER and another
+    process is computing one of the cells, when it is REQUIRE and there is nothing to resume, when a label function is
+    broken, or when the first cell cannot start because of its input.
     """
     check_labels(cells)
-    store = Store.open(store_url)
+    store = Store.open(store_url, artifacts=artifacts)
+    free = places(device, per_device)
+    jobs = _bounded(jobs, free)
     try:
+        settings = _settings(store, device, resume)
         plans = {cell: plan_cell(store, cell, resume) for cell in cells}
         source = SweepSource(store, {cell: plan for cell, plan in plans.items() if not plan.skipped}, jobs, resume)
-        pool = _Pool(store, source, _settings(store, device, resume), jobs, on_event, worker)
+        pool = _Pool(store, source, settings, jobs, on_event, worker, free)
         for plan in plans.values():
             if plan.skipped is not None:
                 pool.emit(plan.skipped)
@@ -78,28 +90,47 @@ def run_waiting(
     on_event: Callable[[Event], None],
     jobs: int = 1,
     device: str = "cpu",
+    per_device: int = 1,
     worker: Sequence[str] = WORKER,
 ) -> tuple[list[Event], bool]:
     """Compute cells that wait in the database, in at most `jobs` processes, until the source ends.
 
-    Returns the final event of each, in the order in which they ended, and whether a signal stopped them. A cell that is
-    stopped, by a signal or because the time of the source is over, waits again.
+    `device` and `per_device` are as for `run_cells`. Returns the final event of each, in the order in which they ended,
+    and whether a signal stopped them. A cell that is stopped, by a signal or because the time of the source is over,
+    waits again.
     """
-    pool = _Pool(store, source, _settings(store, device, Resume.AUTO), jobs, on_event, worker)
+    free = places(device, per_device)
+    settings = _settings(store, device, Resume.AUTO)
+    pool = _Pool(store, source, settings, _bounded(jobs, free), on_event, worker, free)
     pool.raises_bad_input = False
     with counted_signals(pool):
         pool.run()
     return list(pool.results.values()), pool.stop_signals > 0
 
 
+def _bounded(jobs: int, free: Sequence[str]) -> int:
+    """Return how many processes to run at once; say so if these are fewer than wanted."""
+    if not free or jobs <= len(free):
+        return jobs
+    gpus = len(set(free))
+    _LOG.warning("%d runs at once on %d GPU%s; --per-device allows more", len(free), gpus, "s" if gpus > 1 else "")
+    return len(free)
+
+
 def _settings(store: Store, device: str, resume: Resume) -> RunSettings:
-    return RunSettings(device, resume, min(HEARTBEAT_SECONDS, store.stale_seconds / 4))
+    place = None
+    if store.storage is not None:
+        store.storage.require_writable()
+        place = store.storage.place
+    device = "cpu" if device == AUTO else device  # where there are GPUs, each process is given one of them
+    return RunSettings(device, resume, min(HEARTBEAT_SECONDS, store.stale_seconds / 4), place)
 
 
 class _Worker:
-    """A worker process, its claims, and the last event of each of its cells."""
+    """A worker process, its device, its claims, and the last event of each of its cells."""
 
     def __init__(self, job: Job, command: Sequence[str]) -> None:
+        self.device = job.settings.device
         self.spec, self.claims = job.spec, dict(zip(job.cells, job.claims, strict=True))
         self.last = {cell: Event("started", cell, None, 0, job.spec.epochs) for cell in job.cells}
         self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 (closed in `wait`)
@@ -148,7 +179,7 @@ class _Worker:
 
 
 class _Pool:
-    """Up to `jobs` workers at a time."""
+    """Up to `jobs` workers at a time, each on one of the `places` (see `devices`) if there are any."""
 
     def __init__(
         self,
@@ -158,13 +189,14 @@ class _Pool:
         jobs: int,
         on_event: Callable[[Event], None],
         command: Sequence[str],
+        places: Sequence[str] = (),
     ) -> None:
         self.raises_bad_input = True  # of the first cell
         self.results: dict[Cell, Event] = {}
         self.stop_signals = 0
         self._store, self._source, self._settings, self._jobs = store, source, settings, jobs
         self._on_event, self._next_heartbeat = on_event, 0.0
-        self._command = command
+        self._command, self._places = command, places
         self._workers: list[_Worker] = []
         self._selector = selectors.DefaultSelector()
 
@@ -203,7 +235,11 @@ class _Pool:
                 return
             cells = list(claims)
             seeds = tuple(cell.seed for cell in cells)
-            job = Job(cells[0].spec, seeds, self._store.url, self._settings, tuple(claims.values()))
+            settings = self._settings
+            if self._places:
+                device = least_used(self._places, [worker.device for worker in self._workers])
+                settings = replace(settings, device=device)
+            job = Job(cells[0].spec, seeds, self._store.url, settings, tuple(claims.values()))
             worker = _Worker(job, self._command)
             self._workers.append(worker)
             self._selector.register(worker.stdout, selectors.EVENT_READ, worker)

@@ -14,7 +14,7 @@ from ssmail.errors import InputError
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event
 from ssmail.store import RunRow, RunState, Store
-from ssmail.store.checkpoint_files import LASTS
+from ssmail.store.checkpoint_files import LAST, LASTS
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,10 @@ def plan_cell(store: Store, cell: Cell, resume: Resume) -> Plan:
 
 
 def _has_checkpoint(store: Store, row: RunRow) -> bool:
-    return any((store.checkpoint_root / row.id / name).exists() for name in LASTS)
+    if any((store.checkpoint_root / row.id / name).exists() for name in LASTS):
+        return True
+    recorded = [item for item in store.artifacts(row.id) if item.name == LAST]
+    return store.storage is not None and any(map(store.storage.has, recorded))
 
 
 def _check_data(cell: Cell, row: RunRow) -> None:

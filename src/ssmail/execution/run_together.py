@@ -1,6 +1,5 @@
 """Computes cells in this process: trains, stores metrics and checkpoints, and resumes unfinished runs."""
 
-import os
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,11 +15,13 @@ from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, masked
 from ssmail.execution import Resume
 from ssmail.execution.cells import Cell, Event, Kind, RunSettings
+from ssmail.execution.devices import also_on
 from ssmail.execution.planning import Plan, plan_cell
 from ssmail.store import RunState, RunWriter, Store
-from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
+from ssmail.store.checkpoint_files import BEST, LAST, LASTS
 from ssmail.store.queue import Claim
-from ssmail.training.checkpoint import AFRESH, UnfitState, load_checkpoint, save_checkpoint
+from ssmail.store.recorded_checkpoints import load_recorded
+from ssmail.training.checkpoint import AFRESH, UnfitState, checkpoint_bytes, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
 
 
@@ -85,9 +86,9 @@ def run_together(
             on_event(started)
         else:
             runs.append(started)
-            on_event(started.event("resumed" if started.resumed else "started"))
+            on_event(started.event("resumed" if started.resumed else "started", message=started.remark))
     with _heartbeats([run.writer for run in runs], settings.heartbeat_seconds):
-        _train([run for run in runs if run.attempt(run.record_snapshot, on_event)], on_event, should_stop)
+        _train([run for run in runs if run.attempt(run.begin, on_event)], on_event, should_stop)
 
 
 def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop, claim: Claim | None) -> "_Run | Event":
@@ -99,8 +100,8 @@ def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop,
         if settings.device.startswith("cuda") and not torch.cuda.is_available():
             raise InputError("PyTorch finds no CUDA device on this machine; use --device cpu")
         loop = make_loop(cell.spec, cell.seed, settings.device)
-        writer = _open_run(cell, store, settings, plan, loop, claim)
-        return _Run(cell, loop, writer, resumed=plan.row is not None and plan.row.has_begun)
+        writer, remark = _open_run(cell, store, settings, plan, loop, claim)
+        return _Run(cell, loop, writer, resumed=plan.row is not None and plan.row.has_begun, remark=remark)
     except Exception as error:
         bad_input = isinstance(error, InputError)
         return Event("failed", cell, None, 0, cell.spec.epochs, message=_summary(error), bad_input=bad_input)
@@ -108,38 +109,40 @@ def _start(cell: Cell, store: Store, settings: RunSettings, make_loop: MakeLoop,
 
 def _open_run(
     cell: Cell, store: Store, settings: RunSettings, plan: Plan, loop: Loop, claim: Claim | None
-) -> RunWriter:
-    """Start a new run, or resume the planned one and load its last checkpoint into `loop`."""
+) -> tuple[RunWriter, str]:
+    """Start a new run, or resume the planned one and load its last checkpoint into `loop`.
+
+    Returns the writer, and what there is to say.
+    """
+    begun = {"dataset_hash": loop.dataset_hash, "device": settings.device}
     if plan.row is None:
         repeat = settings.resume is Resume.NEVER
-        return store.start_run(
-            cell.spec, cell.seed, dataset_hash=loop.dataset_hash, device=settings.device, repeat=repeat
-        )
+        return store.start_run(cell.spec, cell.seed, repeat=repeat, **begun), ""
     if not plan.row.has_begun:
-        begun = {"dataset_hash": loop.dataset_hash, "device": settings.device}
-        return store.resume_run(plan.row.id, 0, claim, **begun)
+        return store.resume_run(plan.row.id, 0, claim, **begun), ""
     if plan.row.dataset_hash != loop.dataset_hash:
         raise InputError(
             f"the data of run {plan.row.name} has changed since it was interrupted; start a new run with --resume never"
         )
-    _load_last(store, plan.row.id, loop)
-    return store.resume_run(plan.row.id, loop.epoch, claim)
+    remark = _load_last(store, plan.row.id, loop)
+    device = also_on(plan.row.device, settings.device) if loop.epoch else settings.device
+    return store.resume_run(plan.row.id, loop.epoch, claim, device=device), remark
 
 
-def _load_last(store: Store, run_id: str, loop: Loop) -> None:
-    """Load the run's last checkpoint, if it has one, into `loop`. Raises InputError when it is not as recorded."""
-    folder = run_folder(store.checkpoint_root, run_id)
-    recorded = [row for row in store.artifacts(run_id) if row.name == LAST]
-    sha256 = recorded[0].sha256 if recorded else None  # runs of older versions record it at their end only
-    last = recorded[0].path if recorded else folder / LAST
-    if last is None or last.name not in LASTS:
-        raise InputError(f"run {run_id[:8]} has its checkpoint recorded in another folder; {AFRESH}")
-    if not os.path.lexists(last):
-        return
+def _load_last(store: Store, run_id: str, loop: Loop) -> str:
+    """Load the run's last checkpoint into `loop`; return what there is to say if it recorded one that is missing.
+
+    Raises InputError when it is not as recorded.
+    """
+    where, state = load_recorded(store, run_id, LAST)
+    if state is None:
+        recorded = any(row.name == LAST for row in store.artifacts(run_id))
+        return "its checkpoint is not here, nor where --artifacts says, so it starts again" if recorded else ""
     try:
-        loop.load_state_dict(load_checkpoint(last, sha256))
+        loop.load_state_dict(state)
     except UnfitState as error:
-        raise InputError(f"the checkpoint {last} does not fit its run ({error}); {AFRESH}") from error
+        raise InputError(f"the checkpoint {where} does not fit its run ({error}); {AFRESH}") from error
+    return ""
 
 
 class _Run:
@@ -147,10 +150,12 @@ class _Run:
 
     # Each epoch is written in this order: metrics, arrays, checkpoint, and the checkpoint's record. So a recorded
     # checkpoint is never ahead of the database, and what a killed process stored after it is computed again, to the
-    # same bits. Two files take turns: the recorded one stays until the next one has a record.
+    # same bits. Two files take turns: the recorded one stays until the next one has a record. In a place that every
+    # machine reaches, files are objects named after their content, and a process on another machine has only the
+    # records to go by, so the best model is recorded at once, too.
 
-    def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool) -> None:
-        self.cell, self.loop, self.writer, self.resumed = cell, loop, writer, resumed
+    def __init__(self, cell: Cell, loop: Loop, writer: RunWriter, *, resumed: bool, remark: str = "") -> None:
+        self.cell, self.loop, self.writer, self.resumed, self.remark = cell, loop, writer, resumed, remark
         self.epochs = cell.spec.epochs
 
     def event(self, kind: Kind, metrics: Mapping[str, float] | None = None, message: str = "") -> Event:
@@ -166,6 +171,12 @@ class _Run:
             on_event(event)
         return event is None or not event.is_final
 
+    def begin(self) -> None:
+        """Store what the loop has before its first epoch here."""
+        self.record_snapshot()
+        if self.loop.epoch and self.writer.storage and not self.writer.objects().keys() >= {BEST, LAST}:
+            self._save(best=True)  # the epochs before were computed without it
+
     def record_snapshot(self) -> None:
         if self.loop.snapshot:
             self.writer.arrays(self.loop.snapshot)
@@ -180,11 +191,7 @@ class _Run:
             return self.fail(outcome)
         self.writer.epoch(self.loop.epoch, outcome)
         self.record_snapshot()
-        if self.loop.improved:
-            save_checkpoint(self.writer.folder / BEST, self.loop.best_state_dict())
-        last = self._last_name()
-        save_checkpoint(self.writer.folder / last, self.loop.state_dict())
-        self.writer.artifact(LAST, last)
+        self._save(best=self.loop.improved)
         return self.event("epoch", outcome)
 
     def evaluate(self) -> Event:
@@ -206,6 +213,18 @@ class _Run:
             self.writer.finish(RunState.FAILED, f"{_summary(error)}\n\n{masked(trace)}")
         return self.event("failed", message=_summary(error))
 
+    def _save(self, best: bool) -> None:
+        """Store and record the checkpoint of this epoch, and before it the best model if there is a new one."""
+        states = {BEST: self.loop.best_state_dict()} if best else {}
+        states[LAST] = self.loop.state_dict()
+        if self.writer.storage is not None:
+            self.writer.store_objects({name: checkpoint_bytes(state) for name, state in states.items()})
+            return
+        files = {BEST: BEST, LAST: self._last_name()}
+        for name, state in states.items():
+            save_checkpoint(self.writer.folder / files[name], state)
+        self.writer.artifact(LAST, files[LAST])
+
     def _last_name(self) -> str:
         """Return the name of the checkpoint file of this epoch; that of the final one is LAST."""
         return LASTS[(self.epochs - self.loop.epoch) % 2]
@@ -213,10 +232,12 @@ class _Run:
     def _record_checkpoints(self, last: str) -> None:
         """Record the checkpoints of a run that ends, and remove what an earlier epoch or a killed process left."""
         folder = self.writer.folder
-        for name, file in ((BEST, BEST), (LAST, last)):
+        kept = {} if self.writer.storage else {BEST: BEST, LAST: last}  # objects are recorded already
+        for name, file in kept.items():
             if (folder / file).exists():
                 self.writer.artifact(name, file)
-        for stray in (*folder.glob(".*.partial"), *(folder / name for name in LASTS if name != last)):
+        others = (folder / file for file in (BEST, *LASTS) if file not in kept.values())
+        for stray in (*folder.glob(".*.partial"), *others):
             stray.unlink(missing_ok=True)
 
 

@@ -7,7 +7,6 @@ for any reason, so that no worker goes on training.
 import os
 import signal
 import threading
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
 
     import torch  # imported late: it takes seconds, in which the signals above must be handled already
 
-    from ssmail.execution.cells import AUTO, Event, Job
+    from ssmail.execution.cells import Event, Job
     from ssmail.execution.run_together import run_together
     from ssmail.store import Store
     from ssmail.store.connection import BUSY_SECONDS
@@ -42,12 +41,9 @@ def main(make_loop: "MakeLoop | None" = None) -> None:
 
     torch.set_num_threads(1)
     job = Job.from_line(line)
-    settings = job.settings
-    if settings.device == AUTO:
-        settings = replace(settings, device="cuda" if torch.cuda.is_available() else "cpu")
-    store = Store.open(job.store_url, patience=BUSY_SECONDS)
+    store = Store.open(job.store_url, patience=BUSY_SECONDS, artifacts=job.settings.artifacts)
     claims = dict(zip(job.cells, job.claims, strict=True))
-    run_together(job.cells, store, settings, send, stop.is_set, make_loop or TrainingLoop, claims)
+    run_together(job.cells, store, job.settings, send, stop.is_set, make_loop or TrainingLoop, claims)
 
 
 def _read_line() -> bytes:

@@ -1,7 +1,6 @@
 """The trained model of a stored run, in the units of its data: `load_run` returns a `TrainedRun`."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,11 +17,12 @@ from ssmail.data.scaling import Scaling
 from ssmail.data.trajectories import LARGEST_SCALED, Floats
 from ssmail.errors import InputError
 from ssmail.store import RunRow, Store
-from ssmail.store.checkpoint_files import BEST, LAST, LASTS, run_folder
+from ssmail.store.checkpoint_files import BEST, LAST
 from ssmail.store.connection import as_url
-from ssmail.store.maintenance.sqlite_file import existing
+from ssmail.store.maintenance.whole_databases import existing
+from ssmail.store.recorded_checkpoints import load_recorded
 from ssmail.training.batches import to_numpy
-from ssmail.training.checkpoint import UnfitState, fitted_number, load_checkpoint
+from ssmail.training.checkpoint import UnfitState, fitted_number
 from ssmail.training.learner import Predictor
 from ssmail.training.predictor_spec import PredictorSpec, last_weights
 
@@ -146,20 +146,28 @@ class TrainedRun:
         return positions.reshape(samples, len(states), *positions.shape[1:])
 
 
-def load_run(run: str, db: str | Path, *, model: Model = "best", data: str | Path | None = None) -> TrainedRun:
+def load_run(
+    run: str,
+    db: str | Path,
+    *,
+    model: Model = "best",
+    data: str | Path | None = None,
+    artifacts: str | None = None,
+) -> TrainedRun:
     """Load the trained model of a run.
 
     run: the id of a run, or its first digits. db: the database, a path or an SQLAlchemy URL, with its checkpoints
     beside it. model: the one with the smallest validation error, or that of the last epoch. data: the expert set that
     the run was trained on; only needed for runs of ssmail 0.1 and earlier on data from a file, which did not store
-    their scaling.
+    their scaling. artifacts: the folder or URL where training kept the checkpoints, by default that of SSMAIL_ARTIFACTS
+    if it is set.
 
-    Nothing that the database names is run, imported or opened, except the run's checkpoints in the folder beside it.
+    Nothing that the database names is run, imported or opened, except the run's checkpoints in these two places.
     Raises InputError if there is no such run, or if it has no such model.
     """
     if as_url(db).get_backend_name() == "sqlite":
         existing(db)  # opening it would create it
-    store = Store.open(db)
+    store = Store.open(db, artifacts=artifacts)
     try:
         return load_from(store, run, model=model, data=data)
     finally:
@@ -225,15 +233,13 @@ def _spec(row: RunRow) -> RunSpec:
 
 def _checkpoint(store: Store, row: RunRow, name: str) -> dict[str, Any]:
     """Return the checkpoint that a run recorded under a name, or left in its folder so far. Raises InputError."""
-    recorded = [item for item in store.artifacts(row.id) if item.name == name]
-    path = recorded[0].path if recorded else run_folder(store.checkpoint_root, row.id) / name
-    if path is None or path.name not in (BEST, *LASTS):
-        raise InputError(f"run {row.name} has its checkpoint recorded in another folder; `ssmail db check` names such")
-    if not os.path.lexists(path):
+    where, state = load_recorded(store, row.id, name)
+    if state is None:
         raise InputError(
-            f"run {row.name} has no model: there is no {path}; train it, or copy its checkpoints beside the database"
+            f"run {row.name} has no model: there is no {where}; train it, copy its checkpoints beside the database, or "
+            "give the place that it was trained with as --artifacts"
         )
-    return load_checkpoint(path, recorded[0].sha256 if recorded else None)
+    return state
 
 
 def _refitted(spec: RunSpec, row: RunRow, data: str | Path | None) -> PredictorSpec:

@@ -1,8 +1,10 @@
 """Rows of runs and artifacts, and the queries on an open connection that the Store shares with maintenance."""
 
 import json
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
@@ -13,7 +15,7 @@ from sqlalchemy import BigInteger, ColumnElement, Connection, Select, Table, cas
 
 from ssmail.config.changes import changes, with_changes
 from ssmail.config.spec import with_added_keys
-from ssmail.errors import InputError
+from ssmail.errors import InputError, shortened
 from ssmail.store import schema
 from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, UnsoundError, raw, sound
@@ -68,6 +70,11 @@ class RunRow:
         return self.spec_hash, self.seed, self.dataset_hash
 
     @property
+    def deterministic(self) -> bool:
+        """Whether the same code on the same machine computes the same numbers: on a CPU alone, not on a GPU."""
+        return self.device == "cpu"
+
+    @property
     def code(self) -> str:
         """The code that computed the run: "0.1.0+COMMIT", with "-dirty" where the tree was changed."""
         commit = f"+{self.git_commit}" if self.git_commit else ""
@@ -112,7 +119,8 @@ class RunRow:
 class ArtifactRow:
     """A file that a run recorded. `path` is absolute; the file may have been deleted since.
 
-    It is None if what is stored is not the path of a file in the run's own folder: no other file is ever touched.
+    It is None if what is stored is not the path of a file in the run's own folder: no other file is ever touched. With
+    --artifacts, runs record objects instead: those have their SHA-256 as the name of the file (`by_content`).
     """
 
     run_id: str
@@ -120,6 +128,11 @@ class ArtifactRow:
     path: Path | None
     sha256: str
     size_bytes: int
+
+    @property
+    def by_content(self) -> bool:
+        """Whether it was stored as an object, in a place that the user names (see `artifact_storage`)."""
+        return self.path is not None and self.path.name == self.sha256
 
 
 def runs(
@@ -189,6 +202,14 @@ def clock(connection: Connection) -> datetime:
         return datetime.now(UTC)
     now: datetime = connection.execute(select(func.clock_timestamp())).scalar_one()
     return now.astimezone(UTC)
+
+
+def runs_of(connection: Connection, run_ids: Iterable[str]) -> list[RunRow]:
+    """Return the runs with these full ids, newest last."""
+    wanted = list(dict.fromkeys(run_ids))
+    parts = (wanted[first : first + MOST_AT_ONCE] for first in range(0, len(wanted), MOST_AT_ONCE))
+    found = [row for part in parts for row in runs(connection, schema.run.c.id.in_(part))]
+    return sorted(found, key=lambda row: (row.started, row.id))
 
 
 def silent_runs(
@@ -312,3 +333,12 @@ def _file_of_run(root: Path, run_id: str, stored: object) -> Path | None:
     folder, _, name = str(stored).partition("/")
     plain = schema.is_run_id(run_id) and folder == run_id and re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name)
     return root / run_id / name if plain else None
+
+
+def chosen_stale_seconds() -> float:
+    """Return the value of SSMAIL_STALE_SECONDS, by default STALE_SECONDS. Raises InputError if it is no such number."""
+    text = os.environ.get("SSMAIL_STALE_SECONDS")
+    with suppress(ValueError):
+        if text is None or 0 < float(text) < 1e6:
+            return STALE_SECONDS if text is None else float(text)
+    raise InputError(f"SSMAIL_STALE_SECONDS is {shortened(str(text), 40)!r}; give a number of seconds above 0")

@@ -1,11 +1,10 @@
 """The Store: one database that holds every run, its metrics and the arrays that the figures draw."""
 
-import os
 import uuid
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from copy import copy
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -15,9 +14,10 @@ from sqlalchemy import Connection, Engine, Table, delete, select, update
 from ssmail.config.spec import RunSpec
 from ssmail.errors import InputError, SsmailError, shortened
 from ssmail.store import arrays, queries, run_metadata, schema, server
+from ssmail.store.artifact_storage import ArtifactStorage, storage_of
 from ssmail.store.checkpoint_files import checkpoint_root, remove_run_folder
 from ssmail.store.connection import connect, describe, read, reading, write
-from ssmail.store.queries import MOST_AT_ONCE, STALE_SECONDS, ArtifactRow, RunRow
+from ssmail.store.queries import STALE_SECONDS, ArtifactRow, RunRow
 from ssmail.store.queue import Claim, Queue, end, insert_row, interrupt, new_row
 from ssmail.store.schema import RunState, in_byte_order
 from ssmail.store.validation import DamagedRow, is_name, metric_fault, raw
@@ -36,8 +36,8 @@ class Store:
     met so far, and left out.
     """
 
-    def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS) -> None:
-        self._engine = engine
+    def __init__(self, engine: Engine, stale_seconds: float = STALE_SECONDS, artifacts: str | None = None) -> None:
+        self._engine, self._artifacts = engine, artifacts
         self.url = engine.url.render_as_string(hide_password=False)
         self.where = describe(engine)
         self.stale_seconds = stale_seconds
@@ -46,14 +46,27 @@ class Store:
         self._only: frozenset[str] | None = None  # ids of the runs that `runs` returns; None: of any
 
     @classmethod
-    def open(cls, where: str | Path, *, stale_seconds: float | None = None, patience: float = 0.0) -> Self:
+    def open(
+        cls,
+        where: str | Path,
+        *,
+        stale_seconds: float | None = None,
+        patience: float = 0.0,
+        artifacts: str | None = None,
+    ) -> Self:
         """Open the database at `where`, a path or an SQLAlchemy URL; create it or upgrade its schema if necessary.
 
-        patience: how many seconds to wait for a server that cannot be reached.
-        Raises InputError when the place cannot be used, the file is not an ssmail database, or its schema is newer.
+        patience: how many seconds to wait for a server that cannot be reached. artifacts: a folder or URL for
+        checkpoints, by default that of SSMAIL_ARTIFACTS.
+        Raises InputError when a place cannot be used, the file is not an ssmail database, or its schema is newer.
         """
-        stale = _stale_seconds() if stale_seconds is None else stale_seconds
-        return cls(connect(where, patience), stale)
+        stale = queries.chosen_stale_seconds() if stale_seconds is None else stale_seconds
+        return cls(connect(where, patience), stale, artifacts)
+
+    @cached_property
+    def storage(self) -> ArtifactStorage | None:  # made late: most commands read no checkpoint, and need no driver
+        """Where checkpoints are instead of the folder. Raises InputError for a place that cannot be used."""
+        return storage_of(self._artifacts)
 
     def close(self) -> None:
         """Close every connection; the next call opens new ones."""
@@ -115,15 +128,8 @@ class Store:
         self.close()  # open connections would still read a file that has been removed
         if self._engine.dialect.name == "sqlite" and not Path(self.where).exists():
             return []
-        wanted = list(dict.fromkeys(run_ids))
-
-        def find(connection: Connection) -> list[RunRow]:
-            parts = (wanted[first : first + MOST_AT_ONCE] for first in range(0, len(wanted), MOST_AT_ONCE))
-            found = [row for part in parts for row in queries.runs(connection, schema.run.c.id.in_(part))]
-            return sorted(found, key=lambda row: (row.started, row.id))
-
         try:
-            return read(self._engine, find)
+            return read(self._engine, lambda connection: queries.runs_of(connection, run_ids))
         except SsmailError:
             return []
 
@@ -182,11 +188,12 @@ class Store:
             insert_row(connection, row, queries.clock(connection))
 
         write(self._engine, start)
-        return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"])
+        return RunWriter(self._engine, self.checkpoint_root, row["id"], row["owner"], storage=self.storage)
 
     def resume_run(self, run_id: str, from_step: int, claim: Claim | None = None, **begun: str | None) -> RunWriter:
         """Continue an unfinished run after epoch `from_step`, dropping the metrics of later epochs.
 
+        From step 0, the records of checkpoints are dropped too: they would be ahead of the metrics.
         With a claim of the run, only who made it may do so. begun: its columns dataset_hash and device, if they change.
         If several processes try at once, only one succeeds. Raises InputError when another process is computing the run
         or there is no such run, SsmailError when it has finished or diverged, or has recorded fewer epochs than
@@ -204,6 +211,8 @@ class Store:
             if row.state.settled:
                 raise SsmailError(f"run {row.name} has {row.state} and cannot be resumed")
             drop_metrics_after(connection, row, from_step)
+            if from_step == 0:
+                connection.execute(delete(schema.artifact).where(schema.artifact.c.run_id == run_id))
             met.append(row)
             before = met[0] if claim else row
             changes = {
@@ -220,7 +229,7 @@ class Store:
             return row
 
         row = write(self._engine, resume)
-        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row)
+        return RunWriter(self._engine, self.checkpoint_root, run_id, owner, resumed=row, storage=self.storage)
 
     def mark_stale(self) -> list[RunRow]:
         """Mark the RUNNING runs without a recent heartbeat as INTERRUPTED; return their rows from before the change."""
@@ -240,20 +249,27 @@ class Store:
     def delete(self, run_ids: Sequence[str]) -> None:
         """Delete the runs (full ids or prefixes), everything they recorded, and their checkpoint files.
 
-        Raises InputError, and deletes nothing, when an id is unknown or ambiguous or a run is being computed. A damaged
-        run is deleted too, whatever it says of its process.
+        In the storage, those objects are deleted that they recorded. Raises InputError, and deletes nothing, when an id
+        is unknown or ambiguous or a run is being computed. A damaged run is deleted too, whatever it says of its
+        process.
         """
         full: list[str] = []
+        objects: dict[str, list[str]] = {}
 
         def delete_idle(connection: Connection, again: bool) -> None:
             full[:] = full if again and full else queries.resolve(connection, run_ids)
             for row in queries.runs(connection, schema.run.c.id.in_(full), for_update=True):
                 self.require_idle(row)
+            for run_id in full:
+                found = queries.artifacts(connection, run_id, self.checkpoint_root)
+                objects[run_id] = [row.sha256 for row in found] or objects.get(run_id, [])
             connection.execute(delete(schema.run).where(schema.run.c.id.in_(full)))
 
         write(self._engine, delete_idle)
         for run_id in filter(schema.is_run_id, full):
             remove_run_folder(self.checkpoint_root, run_id)
+            if self.storage is not None:
+                self.storage.remove(run_id, objects[run_id])
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
@@ -337,12 +353,3 @@ class Store:
     def is_compact(self, run: RunRow) -> bool:
         """Return whether a run that ended has no checkpoint: a compact database keeps only what figures read of it."""
         return run.state.settled and not self.artifacts(run.id)
-
-
-def _stale_seconds() -> float:
-    """Return the value of SSMAIL_STALE_SECONDS, by default STALE_SECONDS. Raises InputError if it is no such number."""
-    text = os.environ.get("SSMAIL_STALE_SECONDS")
-    with suppress(ValueError):
-        if text is None or 0 < float(text) < 1e6:
-            return STALE_SECONDS if text is None else float(text)
-    raise InputError(f"SSMAIL_STALE_SECONDS is {shortened(str(text), 40)!r}; give a number of seconds above 0")

@@ -9,6 +9,7 @@ import hashlib
 import math
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,9 @@ from sqlalchemy.exc import IntegrityError
 
 from ssmail.errors import SsmailError
 from ssmail.store import arrays, queries, run_metadata, schema
+from ssmail.store.artifact_storage import ArtifactStorage
 from ssmail.store.checkpoint_files import run_folder
-from ssmail.store.connection import write
+from ssmail.store.connection import read, write
 from ssmail.store.queries import RunRow
 from ssmail.store.queue import left_state
 from ssmail.store.schema import RunState, require_fitting
@@ -29,14 +31,21 @@ class RunWriter:
     """Records one run. Get a RunWriter from Store.start_run or Store.resume_run.
 
     folder: for the run's files; it need not exist yet. resumed: the run's row before this process resumed it; the
-    resources in it are added to those of this process.
+    resources in it are added to those of this process. storage: where its checkpoints go instead of the folder, if
+    the user named a place.
     """
 
     def __init__(
-        self, engine: Engine, checkpoint_root: Path, run_id: str, owner: str, resumed: RunRow | None = None
+        self,
+        engine: Engine,
+        checkpoint_root: Path,
+        run_id: str,
+        owner: str,
+        resumed: RunRow | None = None,
+        storage: ArtifactStorage | None = None,
     ) -> None:
-        self.run_id = run_id
-        self._engine = engine
+        self.run_id, self.storage = run_id, storage
+        self._engine, self._root = engine, checkpoint_root
         self.folder = run_folder(checkpoint_root, run_id)
         self._owner = owner
         # wall and CPU time up to a clock reading; what has passed since then is shared among so many runs
@@ -89,6 +98,29 @@ class RunWriter:
         content = (self.folder / file).read_bytes()
         row = {"name": name, "path": f"{self.run_id}/{file}", "size_bytes": len(content)}
         self._replace(schema.artifact, [{"run_id": self.run_id, **row, "sha256": hashlib.sha256(content).hexdigest()}])
+
+    def objects(self) -> dict[str, str]:
+        """Return the SHA-256 of each object that the run recorded, by its name."""
+        rows = read(self._engine, lambda connection: queries.artifacts(connection, self.run_id, self._root))
+        return {row.name: row.sha256 for row in rows if row.by_content}
+
+    def store_objects(self, contents: Mapping[str, bytes]) -> None:
+        """Put contents into the storage, then record them by name, then remove the objects that they supersede.
+
+        An object that is not recorded, because the process ended or lost the run in between, stays: another process of
+        the run may have recorded the same one.
+        """
+        assert self.storage is not None
+        before = self.objects()
+        now = before | {name: self.storage.put(self.run_id, content) for name, content in contents.items()}
+        rows = [
+            {"run_id": self.run_id, "name": name, "path": f"{self.run_id}/{now[name]}", "sha256": now[name]}
+            | {"size_bytes": len(content)}
+            for name, content in contents.items()
+        ]
+        self._replace(schema.artifact, rows)
+        with suppress(SsmailError):  # a place where nothing may be deleted
+            self.storage.remove(self.run_id, set(before.values()) - set(now.values()))
 
     def finish(self, state: RunState, error: str | None = None) -> None:
         """End the run in `state`, which must not be QUEUED or RUNNING. The writer cannot be used afterwards.

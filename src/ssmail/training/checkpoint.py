@@ -51,15 +51,21 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
     The write is atomic: after a crash or a power cut the file is either the old one or the new one. Raises InputError
     if the file cannot be written.
     """
-    content = io.BytesIO()
-    torch.save(_copied(state), content)  # into memory first: on a full disk torch raises errors of its own
+    content = checkpoint_bytes(state)  # in memory first: on a full disk torch raises errors of its own
     try:
         with atomic_write(path) as partial:
-            partial.write_bytes(content.getbuffer())
+            partial.write_bytes(content)
     except OSError as error:
         raise InputError(
             f"cannot write the checkpoint {path} ({error.strerror}); free or choose another place"
         ) from error
+
+
+def checkpoint_bytes(state: dict[str, Any]) -> bytes:
+    """Return the content of a checkpoint file; the same for equal states."""
+    content = io.BytesIO()
+    torch.save(_copied(state), content)
+    return content.getvalue()
 
 
 def _copied(state: Any) -> Any:
@@ -78,17 +84,30 @@ def load_checkpoint(path: Path, sha256: str | None = None) -> dict[str, Any]:
     """
     try:
         content = _read(path)
-        if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-            raise InputError(f"the checkpoint {path} has been altered since it was recorded; {AFRESH}")
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+        raise InputError(f"the checkpoint {path} has been altered since it was recorded; {AFRESH}")
+    return parse_checkpoint(content, path)
+
+
+def parse_checkpoint(content: bytes, where: str | Path) -> dict[str, Any]:
+    """Return the state whose bytes `checkpoint_bytes` returned, as `load_checkpoint` does; `where` is for messages.
+
+    Raises InputError if it is damaged.
+    """
+    try:
         _check_archive(content)
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except InputError:
-        raise
     except Exception as error:  # damaged bytes can make the unpickler raise anything
-        raise InputError(f"the checkpoint {path} cannot be read ({type(error).__name__}); {AFRESH}") from error
+        raise _unreadable(where, error) from error
     if not isinstance(state, dict):
-        raise InputError(f"{path} is not a checkpoint of ssmail; {AFRESH}")
+        raise InputError(f"{where} is not a checkpoint of ssmail; {AFRESH}")
     return state
+
+
+def _unreadable(where: str | Path, error: Exception) -> InputError:
+    return InputError(f"the checkpoint {where} cannot be read ({type(error).__name__}); {AFRESH}")
 
 
 def _read(path: Path) -> bytes:

@@ -10,9 +10,9 @@ import pytest
 
 from ssmail.errors import InputError
 from ssmail.store import RunState, Store, connection
-from ssmail.store.maintenance import sqlite_file
+from ssmail.store.maintenance import whole_databases
 from ssmail.store.maintenance.checks import check
-from ssmail.store.maintenance.sqlite_file import RunCount, back_up, describe_contents, upgrade
+from ssmail.store.maintenance.whole_databases import RunCount, back_up, describe_contents, upgrade
 from ssmail.store.schema import REVISIONS
 from tests.store.databases import SPEC, add, change, contents, files
 
@@ -74,9 +74,9 @@ def test_a_backup_during_writes_is_one_moment(store: Store, tmp_path: Path) -> N
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from ssmail.store.maintenance import sqlite_file
-sqlite_file._copy_pages = lambda path, partial: (partial.write_bytes(b"half"), os.kill(os.getpid(), signal.SIGKILL))
-sqlite_file.back_up(sys.argv[1], Path(sys.argv[2]))
+from ssmail.store.maintenance import whole_databases
+whole_databases._copy_pages = lambda path, partial: (partial.write_bytes(b"half"), os.kill(os.getpid(), signal.SIGKILL))
+whole_databases.back_up(sys.argv[1], Path(sys.argv[2]))
 """
 
 
@@ -133,7 +133,7 @@ def newer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = scripts / "versions" / "revision_9998.py"
     path.write_text(REVISION.format(before=REVISIONS[-1], then=""))
     monkeypatch.setattr(connection, "_MIGRATIONS", scripts)
-    for module in (connection, sqlite_file):
+    for module in (connection, whole_databases):
         monkeypatch.setattr(module, "REVISIONS", (*REVISIONS, "9998"))
     return path
 
@@ -145,8 +145,8 @@ def test_an_upgrade_keeps_the_old_state(store: Store, newer: Path) -> None:
     done = upgrade(store.where)
     assert (done.before, done.after) == (REVISIONS[-1], "9998")
     assert done.backup is not None
-    assert sqlite_file.revision(done.backup) == REVISIONS[-1]
-    assert sqlite_file.revision(Path(store.where)) == "9998"
+    assert whole_databases.revision(done.backup) == REVISIONS[-1]
+    assert whole_databases.revision(Path(store.where)) == "9998"
     assert contents(done.backup) == contents(store.where) == before
     again = upgrade(store.where)
     assert (again.before, again.backup) == ("9998", None)
@@ -158,7 +158,7 @@ def test_an_upgrade_that_fails_changes_nothing(store: Store, newer: Path) -> Non
     newer.write_text(REVISION.format(before=REVISIONS[-1], then="raise RuntimeError('planted')"))
     with pytest.raises(RuntimeError, match="planted"):
         upgrade(store.where)
-    assert sqlite_file.revision(Path(store.where)) == REVISIONS[-1]
+    assert whole_databases.revision(Path(store.where)) == REVISIONS[-1]
 
 
 def test_an_empty_file_becomes_a_database_without_a_backup(tmp_path: Path) -> None:

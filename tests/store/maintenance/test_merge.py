@@ -309,9 +309,9 @@ def test_an_older_schema_is_one_sentence_with_the_remedy(
     here: Store, there: Store, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from ssmail.store import connection
-    from ssmail.store.maintenance import sqlite_file
+    from ssmail.store.maintenance import whole_databases
 
-    for owner in (connection, sqlite_file):
+    for owner in (connection, whole_databases):
         monkeypatch.setattr(owner, "REVISIONS", ("0001", "0002"))
     sentence = (
         rf"has schema 0001, but this ssmail reads 0002; upgrade it first with `ssmail db upgrade --db {there.where}`"

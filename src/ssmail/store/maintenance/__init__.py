@@ -1,1 +1,1 @@
-"""Maintenance of SQLite databases: checks, backup, merge, compact export."""
+"""Maintenance of databases: checks, backup, upgrades, merge, compact export."""

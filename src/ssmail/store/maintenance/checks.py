@@ -11,9 +11,10 @@ from sqlalchemy import URL, Connection, select
 from ssmail.config.spec import spec_hash
 from ssmail.errors import InputError, command_line, shortened
 from ssmail.store import queries, schema
-from ssmail.store.checkpoint_files import STAGING, checkpoint_root, fault_of
+from ssmail.store.artifact_storage import NOT_GIVEN, ArtifactStorage, place_of, recorded_fault, storage_of
+from ssmail.store.checkpoint_files import STAGING, checkpoint_root
 from ssmail.store.connection import DRIVER_ERRORS, explained, name_of, reading, revision_of
-from ssmail.store.maintenance.sqlite_file import existing, opened
+from ssmail.store.maintenance.whole_databases import existing, opened
 from ssmail.store.queries import RunRow
 from ssmail.store.schema import REVISIONS, RunState
 from ssmail.store.validation import DamagedRow, raw
@@ -40,16 +41,17 @@ class Problem:
     remedy: str
 
 
-def check(where: str | Path) -> list[Problem]:
+def check(where: str | Path, artifacts: str | None = None) -> list[Problem]:
     """Return all problems of a database. Safe while runs are being computed.
 
-    Raises InputError when the database is missing, is not one of ssmail's, or is from a newer ssmail.
+    artifacts: where its checkpoints are, if not beside it (see `Store.open`). Raises InputError when the database is
+    missing, is not one of ssmail's, or is from a newer ssmail.
     """
-    url = existing(where)
+    url, storage = existing(where), storage_of(artifacts)
     folders = _checkpoint_folders(url)  # read before the runs, because a run has its row before its folder
     if url.get_backend_name() != "sqlite":
         with opened(url) as engine, reading(engine, patience=0) as connection:
-            return list(_problems(url, connection, revision_of(connection, engine), folders))
+            return list(_problems(url, connection, revision_of(connection, engine), folders, storage))
     path = Path(str(url.database))
     try:
         with opened(url) as engine, engine.connect() as connection:
@@ -59,7 +61,7 @@ def check(where: str | Path) -> list[Problem]:
             if damage != ["ok"]:
                 return [_damage(path, str(line)) for line in damage]
             orphans = list(_orphans(path, connection)) if revision == REVISIONS[-1] else []
-            return [*orphans, *_problems(url, connection, revision, folders)]
+            return [*orphans, *_problems(url, connection, revision, folders, storage)]
     except DRIVER_ERRORS as error:
         reason = str(getattr(error, "orig", error))
         if "not a database" in reason:
@@ -69,7 +71,13 @@ def check(where: str | Path) -> list[Problem]:
         return [_damage(path, reason)]
 
 
-def _problems(url: URL, connection: Connection, revision: str | None, folders: Sequence[Path]) -> Iterator[Problem]:
+def _problems(
+    url: URL,
+    connection: Connection,
+    revision: str | None,
+    folders: Sequence[Path],
+    storage: ArtifactStorage | None,
+) -> Iterator[Problem]:
     """Find what any database may have; damaged pages, and rows without a run, are for SQLite files only."""
     place = name_of(url)
     if revision != REVISIONS[-1]:
@@ -88,7 +96,7 @@ def _problems(url: URL, connection: Connection, revision: str | None, folders: S
     for run in runs:
         yield from faults_of(connection, run)
     yield from _silent(connection)
-    yield from _checkpoints(url, connection, runs)
+    yield from _checkpoints(url, connection, runs, storage)
     yield from _stray_folders(url, folders, {run.id for run in runs} | {row.run_id for row in damaged})
 
 
@@ -177,16 +185,20 @@ def _silent(connection: Connection) -> Iterator[Problem]:
         yield Problem("stale", run.id, found, remedy)
 
 
-def _checkpoints(url: URL, connection: Connection, runs: Sequence[RunRow]) -> Iterator[Problem]:
-    """Check that the recorded files exist with the recorded content; those of a run at work change meanwhile."""
+def _checkpoints(
+    url: URL, connection: Connection, runs: Sequence[RunRow], storage: ArtifactStorage | None
+) -> Iterator[Problem]:
+    """Check that the recorded files and objects are as recorded; those of a run at work change meanwhile."""
     now = queries.clock(connection)
     for run in runs:
         if run.is_alive(now=now):
             continue
         for row in queries.artifacts(connection, run.id, checkpoint_root(url)):
-            if wrong := fault_of(row):
+            if wrong := recorded_fault(row, storage):
                 again = _again(run.name)
-                remedy = f"copy it from a backup to {row.path}, or {again}" if row.path else again
+                place = place_of(row, storage)
+                remedy = f"copy it from a backup to {place}, or {again}" if place else again
+                remedy = "give that place with --artifacts" if wrong is NOT_GIVEN else remedy
                 yield Problem("checkpoints", run.id, f"the checkpoint {row.name} of run {run.name} is {wrong}", remedy)
 
 

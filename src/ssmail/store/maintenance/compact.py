@@ -14,7 +14,7 @@ from ssmail.errors import InputError
 from ssmail.store import arrays, queries, schema
 from ssmail.store.connection import connect, reading, writing
 from ssmail.store.maintenance.run_rows import copy_rows
-from ssmail.store.maintenance.sqlite_file import existing, new_file, opened, require_current
+from ssmail.store.maintenance.whole_databases import existing, new_file, opened, require_current
 from ssmail.store.queries import RunRow
 from ssmail.store.validation import DamagedRow, shown
 

@@ -15,12 +15,13 @@ from sqlalchemy import URL, Connection, delete, select
 
 from ssmail.errors import InputError
 from ssmail.store import queries, schema, server
+from ssmail.store.artifact_storage import NOT_GIVEN, ArtifactStorage, recorded_fault, storage_of
 from ssmail.store.checkpoint_files import CheckpointCopies, checkpoint_root, fault_of
 from ssmail.store.connection import as_url, connect, name_of, reading, writing
 from ssmail.store.maintenance.checks import Problem, damaged_rows, damaged_run, faults_of
 from ssmail.store.maintenance.run_rows import CHILDREN, Difference, amount, copy_run, first_difference
-from ssmail.store.maintenance.sqlite_file import existing, is_missing, opened, place_of, require_current, revision
-from ssmail.store.queries import RunRow
+from ssmail.store.maintenance.whole_databases import existing, is_missing, opened, place_of, require_current, revision
+from ssmail.store.queries import ArtifactRow, RunRow
 from ssmail.store.validation import DamagedRow, raw
 
 
@@ -70,14 +71,15 @@ class Merge:
         return tuple(item.difference for item in self.runs if item.difference is not None)
 
 
-def merge(where: str | Path, other: str | Path) -> Merge:
+def merge(where: str | Path, other: str | Path, artifacts: str | None = None) -> Merge:
     """Merge the runs of the database `other`, which is only read, into the one at `where`; create it if necessary.
 
     Runs with damaged rows are left out. The merge is one transaction: if it fails, or the process dies at any moment,
-    the target keeps its contents. Raises InputError when a database cannot be used, when both are the same one, or when
-    one has another schema.
+    the target keeps its contents. artifacts: a folder or URL that has the checkpoints of both databases, or gets those
+    beside `other` (see `Store.open`); nothing is deleted there. Raises InputError when a database cannot be used, when
+    both are the same one, or when one has another schema.
     """
-    source, target = existing(other), as_url(where)
+    source, target, storage = existing(other), as_url(where), storage_of(artifacts)
     if _is_same(source, target):
         raise InputError(f"{name_of(source)} is the database itself; give another one to merge into it")
     require_current(source)
@@ -86,7 +88,7 @@ def merge(where: str | Path, other: str | Path) -> Merge:
     connect(where).dispose()  # creates the file, its folder and its tables, or waits for the process that does so
     copies = CheckpointCopies(checkpoint_root(source), checkpoint_root(target))
     try:
-        merged, damaged = _merge(source, target, copies)
+        merged, damaged = _merge(source, target, copies, storage)
         # after the transaction: exchange the checkpoints of runs that the target had before
         copies.place(item.run.id for item in merged if item.enters or item.fate is Fate.ALREADY_THERE)
         copies.commit()
@@ -99,7 +101,7 @@ def merge(where: str | Path, other: str | Path) -> Merge:
         copies.close()
     with opened(target) as engine, reading(engine) as connection:
         files = {run_id: queries.artifacts(connection, run_id, copies.target) for run_id in entered}
-    incomplete = tuple(run_id for run_id, rows in files.items() if any(fault_of(row) for row in rows))
+    incomplete = tuple(run_id for run_id, rows in files.items() if not _are_intact(rows, storage))
     return Merge(place_of(target), place_of(source), tuple(merged), incomplete, damaged)
 
 
@@ -112,13 +114,17 @@ def _is_same(source: URL, target: URL) -> bool:
     return source == target
 
 
-def _merge(source: URL, target: URL, copies: CheckpointCopies) -> tuple[list[MergedRun], tuple[Problem, ...]]:
+def _merge(
+    source: URL, target: URL, copies: CheckpointCopies, storage: ArtifactStorage | None
+) -> tuple[list[MergedRun], tuple[Problem, ...]]:
     """Copy the checkpoints before locking the target; then decide again, and write in one transaction."""
     with opened(source) as theirs, opened(target) as ours:
         with reading(theirs) as there, reading(ours) as here:
             damaged = _damaged(source, here, there)
             merged = _leave_out(decide_fates(here, there, damaged), there, damaged)
-            copies.stage(_wanted_folders(merged, here, copies))
+            copies.stage(_wanted_folders(merged, here, copies, storage))
+            if storage is not None:
+                _put_files([item.run.id for item in merged if item.enters], there, copies.source, storage)
         with reading(theirs) as there, writing(ours) as here:
             server.lock_runs(here)
             merged = decide_fates(here, there, damaged)
@@ -221,12 +227,27 @@ def _with_an_unfinished(here: Connection, there: Connection, run: RunRow, rivals
     return MergedRun(run, Fate.ALREADY_THERE if theirs == ours else Fate.BEHIND)
 
 
-def _wanted_folders(merged: Sequence[MergedRun], here: Connection, copies: CheckpointCopies) -> list[str]:
+def _wanted_folders(
+    merged: Sequence[MergedRun], here: Connection, copies: CheckpointCopies, storage: ArtifactStorage | None
+) -> list[str]:
     """Return the ids of the runs to copy, and of those already there whose files are intact only in the source."""
 
     def is_intact(run_id: str, root: Path) -> bool:
-        return not any(fault_of(row) for row in queries.artifacts(here, run_id, root))
+        return _are_intact(queries.artifacts(here, run_id, root), storage)
 
     there = [item.run.id for item in merged if item.fate is Fate.ALREADY_THERE]
     repaired = [run_id for run_id in there if not is_intact(run_id, copies.target) and is_intact(run_id, copies.source)]
     return [item.run.id for item in merged if item.enters] + repaired
+
+
+def _are_intact(rows: Sequence[ArtifactRow], storage: ArtifactStorage | None) -> bool:
+    """Return whether checkpoints are as recorded, as far as can be seen."""
+    return all(recorded_fault(row, storage) in (None, NOT_GIVEN) for row in rows)
+
+
+def _put_files(run_ids: Sequence[str], there: Connection, root: Path, storage: ArtifactStorage) -> None:
+    """Put the recorded checkpoints of these runs into the storage; a merge that fails leaves them there."""
+    for run_id in run_ids:
+        for row in queries.artifacts(there, run_id, root):
+            if row.path is not None and fault_of(row) is None:
+                storage.put(run_id, row.path.read_bytes())
