@@ -148,7 +148,7 @@ def test_a_launcher_without_its_package_says_how_to_install_it(
 def test_the_commands_of_the_documentation_are_those_of_the_slow_tests() -> None:
     """With the settings that launch a real sweep in tests/execution/test_slurm.py and test_ray.py."""
     text = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text()
-    launched = [line for line in text.splitlines() if line.startswith("ssmail train")]
+    launched = [line for line in text.splitlines() if line.startswith("ssmail train") and "--launcher " in line]
     assert len(launched) == 3
     for line in launched:
         words = shlex.split(line)

@@ -21,7 +21,9 @@ ALLOWED = {
     "cli/ssmail_cli/output.py",
     "src/ssmail/data/mocap/download.py",  # prints without a command line
     "src/ssmail/config/experiments_file.py",  # logs which file is in use,
-    "src/ssmail/execution/sources.py",  # and which run is left in the queue,
+    "src/ssmail/execution/sources.py",  # which run is left in the queue,
+    "src/ssmail/execution/local.py",  # and that there are fewer GPUs than wanted processes,
+    "src/ssmail/execution/launchers.py",  # a job of a cluster, whose stdout is its log
     "cli/ssmail_cli/main.py",  # and notes what is logged
 }
 

@@ -62,8 +62,17 @@ def _in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def trained_by(loop: type, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run_cells(cells: Sequence[Cell], *, store_url: str, on_event: Any, jobs: int, device: str) -> list[Event]:
-        store = Store.open(store_url)
+    def run_cells(
+        cells: Sequence[Cell],
+        *,
+        store_url: str,
+        artifacts: str | None,
+        on_event: Any,
+        jobs: int,
+        device: str,
+        per_device: int,
+    ) -> list[Event]:
+        store = Store.open(store_url, artifacts=artifacts)
         try:
             events = [run_cell(cell, store, RunSettings(device), on_event, lambda: False, loop) for cell in cells]
             if events[0].bad_input:
@@ -267,3 +276,13 @@ def test_a_cancelled_job_interrupts_its_cell(store: Store, cells: list[Cell]) ->
 def test_new_runs_beside_stored_ones_are_refused(store: Store, cells: list[Cell]) -> None:
     with pytest.raises(InputError, match="not never"):
         launch(store, cells, FakeLauncher(), resume=Resume.NEVER)
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_jobs_keep_checkpoints_where_the_sweep_does(
+    store: Store, cells: list[Cell], tmp_path: Path, given: bool
+) -> None:
+    """A node does not have the command's options, nor always its environment."""
+    place = tmp_path / "place"
+    launch(store, cells, FakeLauncher(), artifacts=str(place) if given else None)
+    assert any(path.is_file() for path in place.rglob("*")) is given
