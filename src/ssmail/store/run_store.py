@@ -273,7 +273,9 @@ class Store:
 
     # -- what runs recorded ----------------------------------------------------------------------------------------
 
-    def metrics(self, run_ids: Sequence[str], names: Sequence[str] | None = None, *, after: int = 0) -> "pd.DataFrame":
+    def metrics(
+        self, run_ids: Sequence[str], names: Sequence[str] | None = None, *, after: int | None = None
+    ) -> "pd.DataFrame":
         """Return every metric value of the runs (full ids): columns run_id, seed, name, step, value.
 
         The rows are ordered by the start of the run, name and step. after: only of later epochs than this one.
