@@ -110,3 +110,20 @@ def test_a_collapsed_graph_has_no_entropy() -> None:
     for agents in (3, 1):
         logits, _ = encoder(torch.randn(2, 7, agents, 4))
         assert float(edge_entropy(logits.detach()).max()) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("batch", [4, 5, 16])
+def test_the_entropy_of_several_seeds_is_that_of_each_to_the_last_bit(batch: int) -> None:
+    """Values and gradients, for numbers of edges that are and are not multiples of a processor's vectors."""
+    torch.manual_seed(0)
+    logits = torch.randn(3, batch, 50, 3, 3, 2) * 2
+
+    def results(part: torch.Tensor) -> list[torch.Tensor]:
+        part = part.clone().requires_grad_()
+        found = edge_entropy(part)
+        return [found.detach(), *torch.autograd.grad(found.sum(), part)]
+
+    together = results(logits)
+    for seed in range(3):
+        for whole, alone in zip(together, results(logits[seed : seed + 1]), strict=True):
+            assert torch.equal(whole[seed], alone[0])
