@@ -235,7 +235,7 @@ def test_a_signal_cancels_the_jobs_and_waits_for_their_runs(store: Store, cells:
         if event.kind == "epoch" and event.cell == cells[1]:
             signal.raise_signal(signal.SIGINT)
 
-    launcher = FakeLauncher({1: runs_on_for_a_while, 2: ends_late})
+    launcher, before = FakeLauncher({1: runs_on_for_a_while, 2: ends_late}), signal.getsignal(signal.SIGINT)
     kinds, _ = launch(store, cells, launcher, on_event=on_event)
     assert kinds == ["finished", "interrupted", "interrupted", "interrupted"]
     assert launcher.cancelled == 1
@@ -245,7 +245,7 @@ def test_a_signal_cancels_the_jobs_and_waits_for_their_runs(store: Store, cells:
     assert messages[cells[2]] == "stopped before it started"
     assert messages[cells[3]].startswith("left to another process on ")
     assert store.run(claim.run_id).state is RunState.RUNNING  # it is not ours
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_second_signal_ends_at_once(store: Store, cells: list[Cell]) -> None:
