@@ -13,7 +13,7 @@ from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.launching import Launch
 from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import chosen_format, note, print_rows
-from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
+from ssmail_cli.sweep import finish, is_interrupted, leave, train_sweep
 
 if TYPE_CHECKING:
     from ssmail_cli.progress import Sweep
@@ -63,11 +63,8 @@ def control(
         return
     chosen = chosen_controls(chosen)
     sweep = _sweep(chosen, profile, parse_seeds(seeds), settings or [])
-    if dry_run:
-        print_plan(sweep, db, resume, as_json)
-        return
-    if enqueue_only:
-        enqueue(sweep, db, resume, launcher, as_json)
+    if dry_run or enqueue_only:
+        leave(sweep, db, resume, launcher, dry_run, as_json)
         return
     launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
     rows = train_sweep(sweep, db, launch, as_json, artifacts)

@@ -39,6 +39,14 @@ def train_sweep(sweep: Sweep, db: str, launch: Launch, as_json: bool, artifacts:
     return rows
 
 
+def leave(sweep: Sweep, db: str, resume: Resume, launcher: LauncherName, dry_run: bool, as_json: bool) -> None:
+    """Compute nothing: print what training would do (--dry-run), or let the cells wait for a worker (--enqueue)."""
+    if dry_run:
+        print_plan(sweep, db, resume, as_json)
+    else:
+        enqueue(sweep, db, resume, launcher, as_json)
+
+
 def enqueue(sweep: Sweep, db: str, resume: Resume, launcher: LauncherName, as_json: bool) -> None:
     """Let every cell wait in the store for `ssmail worker`, and print what became of each."""
     from ssmail.execution.planning import check_labels

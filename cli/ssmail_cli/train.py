@@ -19,7 +19,7 @@ from ssmail_cli.artifacts import Artifacts
 from ssmail_cli.launching import Launch
 from ssmail_cli.options import parse_seeds
 from ssmail_cli.output import note
-from ssmail_cli.sweep import enqueue, finish, is_interrupted, print_plan, train_sweep
+from ssmail_cli.sweep import finish, is_interrupted, leave, train_sweep
 
 if TYPE_CHECKING:
     from ssmail.config.experiments import Axis
@@ -74,11 +74,8 @@ def train(
         labels = {"method": method} if len(chosen) > 1 else {}
         labels |= {"environment": environment} if len(places) > 1 else {}
         sweep |= {Cell(spec, seed): {**labels, "seed": seed} for seed in chosen_seeds}
-    if dry_run:
-        print_plan(sweep, db, resume, as_json)
-        return
-    if enqueue_only:
-        enqueue(sweep, db, resume, launcher, as_json)
+    if dry_run or enqueue_only:
+        leave(sweep, db, resume, launcher, dry_run, as_json)
         return
     launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
     finish(sweep, train_sweep(sweep, db, launch, as_json, artifacts))
@@ -146,11 +143,8 @@ def ablate(
         for varied, spec in grid.specs.items()
         for seed in chosen_seeds
     }
-    if dry_run:
-        print_plan(sweep, db, resume, as_json)
-        return
-    if enqueue_only:
-        enqueue(sweep, db, resume, launcher, as_json)
+    if dry_run or enqueue_only:
+        leave(sweep, db, resume, launcher, dry_run, as_json)
         return
     launch = Launch.of(jobs, resume, device, per_device, launcher, launcher_set)
     rows = train_sweep(sweep, db, launch, as_json, artifacts)

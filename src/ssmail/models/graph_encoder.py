@@ -16,13 +16,12 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.models.fast_messages import between_different
-from ssmail.models.linear import Linear, affine
+from ssmail.models.linear import ALIGNED, Linear, affine
 from ssmail.models.message_passing import EdgeFunction, mean_over_senders, perceptron, sender_weights
 
 Memory = tuple[Tensor, Tensor]  # the LSTM's hidden and cell state, each (1, B * N * (N - 1), H)
 
 EDGES = 2**10  # whose LSTM is computed at once
-VECTOR = 64  # numbers, a multiple of what a processor treats at once
 
 
 class EdgeLSTM(nn.LSTM):
@@ -184,9 +183,9 @@ def edge_entropy(logits: Tensor) -> Tensor:
     The diagonal is no edge; a single agent has none, and the entropy 0.
     """
     n, size = logits.shape[-2], logits.shape[1:-1].numel()
-    # torch rounds what is left after whole vectors differently: without padding, seeds trained together would differ
-    # from the same ones alone in the last bit. The last axis is slow for small K.
-    whole = nn.functional.pad(logits.flatten(1, -2), (0, 0, 0, -size % VECTOR))
+    # Without padding, seeds trained together would differ from the same ones alone in the last bit (ALIGNED). The last
+    # axis is slow for small K.
+    whole = nn.functional.pad(logits.flatten(1, -2), (0, 0, 0, -size % ALIGNED))
     log_p = torch.log_softmax(whole.movedim(-1, 0).contiguous(), dim=0)
     entropies = -(log_p.exp() * log_p).sum(dim=0)[:, :size].view(logits.shape[:-1])
     return (entropies * sender_weights(n, logits).squeeze(-1)).sum(dim=(-2, -1)) / n

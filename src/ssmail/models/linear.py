@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 FEW = 16  # columns
+ALIGNED = 64  # numbers, a multiple of those that a processor treats at once: it rounds what is left over differently
 
 
 class BatchedProduct(torch.autograd.Function):

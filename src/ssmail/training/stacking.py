@@ -12,7 +12,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
-ALIGNED = 64  # numbers: processors treat whole vectors and what is left over with different rounding
+from ssmail.models.linear import ALIGNED
+
 Module = TypeVar("Module", bound=nn.Module)
 
 
