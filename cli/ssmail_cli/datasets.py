@@ -20,7 +20,7 @@ Train = Annotated[int | None, typer.Option("--train", help="Training trajectorie
 Validation = Annotated[int | None, typer.Option("--validation", help="Validation trajectories.", show_default=IN_FILE)]
 Test = Annotated[int | None, typer.Option("--test", help="Test trajectories.", show_default=IN_FILE)]
 Steps = Annotated[int | None, typer.Option("--steps", help="Steps of a trajectory.", show_default=IN_FILE)]
-Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the generator.", show_default=IN_FILE)]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of the generator.", show_default=f"{IN_FILE}, else 0")]
 Force = Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")]
 
 
@@ -144,7 +144,7 @@ def _generate(environment: str, ctx: typer.Context, out: Path, force: bool, as_j
     given = {key: value for key, value in ctx.params.items() if key not in ("out", "force", "as_json")}
     overrides = [f"data.{environment}.{key}={json.dumps(value)}" for key, value in given.items() if value is not None]
     data = build_spec(METHODS[0], environment, "quick", overrides, source="the options").data
-    experts = expert_sets.generate(data)
+    experts = expert_sets.generate(data, 0)
     expert_sets.save(experts, out, force=force)
     if as_json:
         write_json({"path": out, "hash": experts.hash, "parameters": experts.parameters}, None)

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from ssmail.config.data_sections import LettersSpec
 from ssmail.config.experiments import build_spec
-from ssmail.data import expert_sets, letters, yjunction
+from ssmail.data import expert_sets, letters
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.results import FIGURES
 from ssmail.plots import provenance
@@ -32,9 +33,13 @@ def test_the_default_set_is_that_of_experiments_yaml(cli: CommandLine, tmp_path:
     out = tmp_path / "deep" / "set.npz"
     outcome = cli("generate-yjunction", "--out", out)
     assert outcome.code == 0
-    params = build_spec("ssail", "yjunction", "quick").data.yjunction
+    data = build_spec("ssail", "yjunction", "quick").data
+    params = data.yjunction
+    assert params is not None
     experts = expert_sets.load(out)
-    assert experts.hash == yjunction.generate(params).hash
+    assert experts.hash == expert_sets.generate(data, 1).hash  # its own seed is 0
+    own = build_spec("ssail", "yjunction", "quick", ["data.yjunction.seed=null"]).data
+    assert experts.hash == expert_sets.generate(own, 0).hash != expert_sets.generate(own, 1).hash
     assert experts.hash[:16] in outcome.out
     assert f"{params.train}/{params.validation}/{params.test}" in outcome.out
 
@@ -60,16 +65,15 @@ def test_every_option_reaches_the_generator(cli: CommandLine, tmp_path: Path) ->
 def test_letters_are_those_of_experiments_yaml_or_of_the_options(cli: CommandLine, tmp_path: Path) -> None:
     out = tmp_path / "letters.npz"
     assert cli("generate-letters", "--out", out).code == 0
-    params = build_spec("ssail", "letters", "quick").data.letters
-    assert params is not None
-    assert expert_sets.load(out, "letters").hash == letters.generate(params).hash
+    data = build_spec("ssail", "letters", "quick").data
+    assert expert_sets.load(out, "letters").hash == expert_sets.generate(data, 0).hash
     wanted = {"word": "NO", "train": 3, "validation": 4, "test": 5, "steps": 40, "jitter": 0.5, "seed": 7}
     options = [part for key, value in wanted.items() for part in (f"--{key}", value)]
     told = json.loads(cli("generate-letters", "--out", out, "--force", "--json", *options).out)
     assert told["parameters"] == {"environment": "letters", **wanted}  # NO is a word, though YAML reads "no" in it
     read = expert_sets.load(out, "letters")
     assert told["hash"] == read.hash
-    made = letters.generate(params.model_copy(update=wanted))
+    made = letters.generate(LettersSpec(**wanted))
     assert made.hash == read.hash
     assert (read.validation.continuations == made.validation.continuations).all()
     refused = cli("train", "--set", f"data.path={out}", "--db", tmp_path / "x.db")

@@ -100,6 +100,27 @@ def test_runs_on_different_data_are_not_compared(store: Store, add_run: Any) -> 
         chosen(store)
 
 
+OWN = ["data.yjunction.seed=null"]  # every seed has data of its own
+
+
+def test_data_that_differ_by_the_seed_alone_are_compared(store: Store, add_run: Any) -> None:
+    data = zip((0, 1), "de", strict=True)
+    ids = [add_run(seed, overrides=OWN, dataset_hash=digit * 64) for seed, digit in data]
+    ids.append(add_run(1, overrides=OWN, method="gail", dataset_hash="e" * 64))
+    assert sum(map(len, chosen(store, ids).values())) == 3
+    ids.append(add_run(1, overrides=OWN, method="wail", dataset_hash="d" * 64))  # one seed, two sets
+    with pytest.raises(InputError, match=r"^fig4 would mix runs on different data \(dddddddd, eeeeeeee\)"):
+        chosen(store, ids)
+
+
+def test_data_that_all_seeds_share_are_not_compared_with_those_of_a_seed(store: Store, add_run: Any) -> None:
+    ids = [add_run(0, overrides=OWN), add_run(1)]
+    assert len(chosen(store, ids)) == 2  # the same data, by chance
+    ids.append(add_run(2, dataset_hash="e" * 64))
+    with pytest.raises(InputError, match=r"^fig4 would mix runs on different data"):
+        chosen(store, ids)
+
+
 def test_a_run_of_another_environment_is_refused(store: Store, add_run: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     run = add_run(0)
     monkeypatch.setattr(series, "figure_requirements", lambda name: FigureRequirements("mocap", ("ssail",)))

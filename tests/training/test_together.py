@@ -16,6 +16,7 @@ from torch import nn
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.spec import RunSpec
+from ssmail.envs.integrator import IntegratorOfSeeds
 from ssmail.training.adversarial import AdversarialLearner
 from ssmail.training.checkpoint import load_checkpoint, save_checkpoint
 from ssmail.training.loop import Divergence, TrainingLoop
@@ -38,6 +39,13 @@ WAYS = {
         "self_supervision.pairing=assignment",
     ),
     "ssail whose actor starts late": ("ssail", "sac.actor_start=0.25", "adversarial.past_share=1.0"),
+    "ssail, each seed on data of its own": ("ssail", "data.yjunction.seed=null"),
+    "wail, each seed on data of its own": ("wail", "data.yjunction.seed=null", "sac.expansion_steps=1"),
+    "ssail whose networks are fitted to data of its own": (
+        "ssail",
+        "data.yjunction.seed=null",
+        "model.standardize=true",
+    ),
 }
 
 
@@ -99,6 +107,23 @@ def test_which_seeds_share_a_process_and_in_which_order_changes_nothing() -> Non
 def test_methods_without_a_common_training_are_trained_one_after_the_other() -> None:
     spec = spec_of("bc")
     assert together(loops(spec)) == alone(spec)
+
+
+def test_each_seed_has_data_of_its_own_where_the_data_have_no_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = spec_of("ssail", "data.yjunction.seed=null")
+    own = loops(spec)
+    assert len({loop.dataset_hash for loop in own}) == len(own)
+    assert len({loop.scaling for loop in own}) == len(own)
+    shared = loops(spec_of("ssail", "data.yjunction.seed=1"))
+    assert {loop.dataset_hash for loop in shared} == {own[1].dataset_hash}
+    # negative control: with the dynamics of the first, the others have other numbers
+    of = IntegratorOfSeeds.of
+    monkeypatch.setattr(IntegratorOfSeeds, "of", lambda each, like: of([each[0]] * len(each), like))
+    zero, one, two = together(own)
+    expected = alone(spec)
+    assert zero == expected[0]
+    assert one != expected[1]
+    assert two != expected[2]
 
 
 def poisoned(network: nn.Module) -> None:

@@ -38,8 +38,8 @@ class YJunctionSpec(Frozen):
     """Angle between the street and each lane."""
     jitter: Jitter
     """Scale of the random starts, gaps, speeds and lateral offsets."""
-    seed: NonNegativeCount
-    """Seed of the generator, which all runs share."""
+    seed: NonNegativeCount | None
+    """Seed of the generator, which all runs share; null: that of the run, so every seed has data of its own."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -75,8 +75,8 @@ class LettersSpec(Frozen):
     """Length of a trajectory."""
     jitter: Jitter
     """Scale of the random starts, shapes, wobble and tempo."""
-    seed: NonNegativeCount
-    """Seed of the generator, which all runs share."""
+    seed: NonNegativeCount | None
+    """Seed of the generator, which all runs share; null: that of the run, so every seed has data of its own."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -14,7 +14,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from pydantic import ValidationError
@@ -29,6 +29,8 @@ from ssmail.data.npz_file import LARGEST_FILE, LONGEST_TEXT, MAGIC, NpzFile, aga
 from ssmail.data.recorded_sets import SetParameters, recorded_set
 from ssmail.data.trajectories import FIELDS, SPLITS, ExpertSet, Trajectories
 from ssmail.errors import InputError, command_line
+
+Params = TypeVar("Params", LettersSpec, YJunctionSpec)
 
 COMMANDS = {
     "yjunction": "ssmail generate-yjunction",
@@ -47,15 +49,19 @@ LARGEST_NUMBER = 2**40  # of a trial or a frame
 DIGEST = re.compile("[0-9a-f]{64}")
 
 
-def generate(data: DataSpec) -> ExpertSet:
+def generate(data: DataSpec, seed: int) -> ExpertSet:
     """Generate the expert set of the environment in spec.GENERATED_ENVIRONMENTS whose parameters `data` has.
 
-    Raises InputError for parameters that no set can have.
+    seed: of the run, for data without a seed of their own. Raises InputError for parameters that no set can have.
     """
     if data.letters is not None:
-        return letters.generate(data.letters)
+        return letters.generate(_seeded(data.letters, seed))
     assert data.yjunction is not None
-    return yjunction.generate(data.yjunction)
+    return yjunction.generate(_seeded(data.yjunction, seed))
+
+
+def _seeded(params: Params, seed: int) -> Params:
+    return params if params.seed is not None else params.model_copy(update={"seed": seed})
 
 
 def check_target(path: Path, *, force: bool) -> None:

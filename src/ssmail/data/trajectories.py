@@ -173,7 +173,12 @@ class ExpertSet:
 def generate_splits(
     params: LettersSpec | YJunctionSpec, generate: Callable[[int, np.random.Generator], Trajectories]
 ) -> dict[str, Trajectories]:
-    """Generate as many trajectories for each split as `params` says, each split from a random stream of its own."""
+    """Generate as many trajectories for each split as `params` says, each split from a random stream of its own.
+
+    Raises ValueError for parameters without a seed (`expert_sets.generate` fills in that of the run).
+    """
+    if params.seed is None:
+        raise ValueError("data without a seed of their own need that of the run")
     seeds = np.random.SeedSequence(params.seed).spawn(len(SPLITS))
     return {
         split: generate(getattr(params, split), np.random.default_rng(seed))

@@ -252,7 +252,7 @@ def _refitted(spec: RunSpec, row: RunRow, data: str | Path | None) -> PredictorS
             f"the checkpoint of run {row.name} was written before ssmail stored the scaling in it; give the expert set "
             "that it was trained on with data=FILE (--data FILE)"
         )
-    experts = generate(spec.data) if data is None else load(Path(data), spec.environment)
+    experts = generate(spec.data, row.seed) if data is None else load(Path(data), spec.environment)
     if experts.hash != row.dataset_hash:
         which = "the expert set that its spec generates" if data is None else str(data)
         raise InputError(f"{which} is not what run {row.name} was trained on (its hash differs); give the right file")

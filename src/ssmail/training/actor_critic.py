@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ssmail.config.sections import SacSpec
+from ssmail.envs.integrator import IntegratorOfSeeds
 from ssmail.losses import PER_SEED
 from ssmail.losses.soft_actor_critic import critic_loss, critic_target, soft_value, temperature_loss
 from ssmail.models.critic import TwinCritic
@@ -101,7 +102,8 @@ class SoftActorCritic:
 
     def __init__(self, seeds: Sequence[ActorCritic], gradient_clip: float) -> None:
         first = seeds[0]
-        self.spec, self.features, self.integrator = first.spec, first.actor.features, first.actor.integrator
+        self.spec, self.features = first.spec, first.actor.features
+        self.integrator = IntegratorOfSeeds.of([seed.actor.integrator for seed in seeds], first.log_temperature)
         self.generators = GeneratorsOfSeeds([seed.generators for seed in seeds])
         self.policy: GraphPolicy
         self.critic: TwinCritic

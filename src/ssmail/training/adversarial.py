@@ -159,6 +159,14 @@ def input_noise(spec: AdversarialSpec, epoch: int, epochs: int) -> float:
     return spec.input_noise * falling
 
 
+def experts_of_seeds(contexts: Sequence[LearnerContext]) -> tuple[Batch, ...]:
+    """Return the training split for each number of agents: what all seeds share, or side by side what each has."""
+    of_each = [context.by_number for context in contexts]
+    if all(torch.equal(a.states, b.states) for own in of_each for a, b in zip(own, of_each[0], strict=True)):
+        return of_each[0]
+    return tuple(Batch.of_seeds(batches) for batches in zip(*of_each, strict=True))
+
+
 class AdversarialTraining:
     """Alternates discriminator steps and soft actor-critic steps on trajectories from replay buffers.
 
@@ -174,10 +182,11 @@ class AdversarialTraining:
         self.adversarial, self.training = first.adversarial, first.training
         self.curriculum = required(spec.curriculum)
         self.supervision, self.wasserstein = spec.self_supervision, spec.wasserstein
-        self.experts, self.device = context.experts, context.device  # the experts of this update's number of agents
+        self.by_number = experts_of_seeds([seed.context for seed in seeds])
+        self.experts, self.device = self.by_number[0], context.device  # the experts of this update's number of agents
         self.input_noise, self.expansion_steps = self.adversarial.input_noise, 0  # of this epoch
         self.actor_critic = SoftActorCritic([seed.actor_critic for seed in seeds], self.training.gradient_clip)
-        self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, context.integrator)
+        self.predictor = PolicyPredictor(self.actor_critic.policy, first.features, self.actor_critic.integrator)
         self.discriminator, block = stacked_modules([seed.discriminator for seed in seeds])
         self.fixed_discriminator = fixed(self.discriminator)
         self.optimizer = StackedAdam(
@@ -199,7 +208,7 @@ class AdversarialTraining:
         turns = self.context.turns(epoch, self.training.updates)
         latest, replay, interventions = {}, {}, []
         for turn in sorted(set(turns)):
-            self.experts = self.context.by_number[turn]
+            self.experts = self.by_number[turn]
             share = turns.count(turn) / len(turns)
             latest[turn], made = self.generate(frequency, max(1, round(share * self.adversarial.rollouts)))
             replay[turn] = self._remember(latest[turn])
@@ -211,7 +220,7 @@ class AdversarialTraining:
         self.expansion_steps = sac.expansion_steps if epoch >= sac.expansion_start * epochs else 0
         logs = []
         for turn in turns:
-            self.experts = self.context.by_number[turn]
+            self.experts = self.by_number[turn]
             logs.append(self.update(latest[turn], replay[turn], actor_learns=actor_learns))
         means = {name: torch.stack([log[name] for log in logs]).double().mean(dim=0).tolist() for name in logs[0]}
         return [
@@ -316,9 +325,12 @@ class AdversarialTraining:
     def _pair(self, generated: Batch, pairing: Pairing) -> Batch:
         """Return the expert trajectory with which to mix each generated one."""
         if pairing == "start":
-            return self.experts[generated.source]
+            return self.experts.at(generated.source)
         if pairing == "nearest":
-            return self.experts[torch.stack([nearest(made, self.experts.states) for made in generated.states])]
+            own = self.experts.states
+            of_each = own if self.experts.source.dim() > 1 else own.expand(len(self.seeds), *own.shape)
+            found = [nearest(made, experts) for made, experts in zip(generated.states, of_each, strict=True)]
+            return self.experts.at(torch.stack(found))
         candidates = self.experts.draw(len(generated), self.generators["data"]).of_each()
         pairs = zip(generated.states, candidates, strict=True)
         return Batch.of_seeds([found[assignment(made, found.states)] for made, found in pairs])

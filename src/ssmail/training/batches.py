@@ -54,7 +54,10 @@ class Batch:
 
         With the generators of S seeds, draw so many for each, from its part of this batch or from what all share.
         """
-        index = drawn(source, lambda g: torch.randint(len(self), (count,), generator=g)).to(self.states.device)
+        return self.at(drawn(source, lambda g: torch.randint(len(self), (count,), generator=g)).to(self.states.device))
+
+    def at(self, index: Tensor) -> "Batch":
+        """Return the trajectories at an index (B,), or (S, B): for each of S seeds, from its part or what all share."""
         if self.source.dim() == 1:
             return self[index]
         seeds = torch.arange(len(index), device=index.device).unsqueeze(1)

@@ -57,11 +57,11 @@ class Divergence(SsmailError):  # noqa: N818 - an outcome of training, not a fau
     """Weights became NaN or infinite."""
 
 
-def expert_set(spec: RunSpec) -> ExpertSet:
-    """Load the expert data of a spec from its file, or generate it if the spec names none."""
+def expert_set(spec: RunSpec, seed: int) -> ExpertSet:
+    """Load the expert data of a spec from its file, or generate it for this seed if the spec names none."""
     if spec.data.path is not None:
         return load(Path(spec.data.path), spec.environment)
-    return generate(spec.data)
+    return generate(spec.data, seed)
 
 
 class TrainingLoop:
@@ -73,14 +73,14 @@ class TrainingLoop:
 
     def __init__(self, spec: RunSpec, seed: int, device: str = "cpu") -> None:
         self.spec, self.device = spec, torch.device(device)
-        self.data = expert_set(spec)
+        self.data = expert_set(spec, seed)
         self.dataset_hash = self.data.hash
         self.scaling = self.data.scaling
         self.generators = Generators(seed)
         self.experts, *others = batches_by_number(self.data.train, self.scaling, self.device)
         self.integrator = Integrator(self.scaling)
-        resolved = resolve(spec, self.data, [self.experts, *others])
-        context = LearnerContext(resolved, self.experts, self.integrator, self.generators, tuple(others))
+        self.resolved = resolve(spec, self.data, [self.experts, *others])
+        context = LearnerContext(self.resolved, self.experts, self.integrator, self.generators, tuple(others))
         self.learner = LEARNERS[spec.method](context)
         self.evaluator = EVALUATORS[spec.environment](context, self.data)
         self.predictor_spec = PredictorSpec.of(context, self.learner.predictor)
@@ -109,14 +109,17 @@ class TrainingLoop:
 
         Returns, for each, what `run_epoch` of the seed alone would return or raise.
         """
-        began = time.perf_counter()
-        learners = [loop.learner for loop in loops if isinstance(loop.learner, AdversarialLearner)]
-        if len(learners) == len(loops):
-            trained = AdversarialLearner.run_epochs(learners, loops[0].epoch)
-        else:
-            trained = [loop.learner.run_epoch(loop.epoch) for loop in loops]
-        share = (time.perf_counter() - began) / len(loops)
-        return [loop._after_training(values, share) for loop, values in zip(loops, trained, strict=True)]
+        trained: dict[int, tuple[dict[str, float], float]] = {}
+        for group in _side_by_side(loops):
+            began = time.perf_counter()
+            learners = [loop.learner for loop in group if isinstance(loop.learner, AdversarialLearner)]
+            if len(learners) == len(group):
+                values = AdversarialLearner.run_epochs(learners, loops[0].epoch)
+            else:
+                values = [loop.learner.run_epoch(loop.epoch) for loop in group]
+            share = (time.perf_counter() - began) / len(group)
+            trained |= {id(loop): (own, share) for loop, own in zip(group, values, strict=True)}
+        return [loop._after_training(*trained[id(loop)]) for loop in loops]
 
     def _after_training(self, values: dict[str, float], seconds: float) -> "dict[str, float] | Divergence":
         """Validate after an epoch of training that took `seconds`, and return all metrics of the epoch."""
@@ -189,6 +192,21 @@ class TrainingLoop:
         best = {"epoch": self.best["epoch"], "error": self.best["error"], "policy": self.best["weights"]}
         return {**best, "predictor": self.predictor_spec.state_dict()}
 
+    @property
+    def _decided(self) -> str:
+        """The data, if they decide more than the scaling; networks of seeds that differ in it are not stacked."""
+        model = self.spec.model
+        given = model is not None and not model.standardize and None not in (model.action_step, model.action_bound)
+        return "" if given and self.resolved == self.spec else self.dataset_hash
+
     def _is_finite(self) -> bool:
         parameters = (p for network in self.learner.networks() for p in network.parameters())
         return all(bool(torch.isfinite(p).all()) for p in parameters)
+
+
+def _side_by_side(loops: Sequence[TrainingLoop]) -> list[list[TrainingLoop]]:
+    """Return the loops in groups whose networks can be stacked."""
+    groups: dict[str, list[TrainingLoop]] = {}
+    for loop in loops:
+        groups.setdefault(loop._decided, []).append(loop)
+    return list(groups.values())
