@@ -25,7 +25,6 @@ from ssmail.evaluation.statistics import as_table
 Alternative = Literal["two-sided", "less", "greater"]
 
 ALPHA = 0.05
-SEEDS_FOR_EVERY = math.ceil(-math.log2(ALPHA))  # so many of so many show that most seeds succeed: 2 ** -n <= ALPHA
 POWER = 0.8  # the probability with which a planned test at ALPHA decides
 MAX_SPLITS = 200_000  # that a permutation test counts: 10 against 10 runs
 MAX_SEEDS = 1000  # beyond which a planned test counts as out of reach
