@@ -30,8 +30,8 @@ SUMMARY = {
 SPARE = ("profile", "more_seeds", "p", "corrected", "p_holm")  # what a narrow terminal leaves out first
 NAMES = f"C1 to C{len(CLAIMS)}, or {', '.join(FIGURES[figure].alias for figure in CLAIMS)}"
 LEGEND = (
-    "Verdicts are at 0.05 for each part of a claim. p is one-sided and counts the parts, the next columns count all "
-    "eight claims; docs/claims.md has the tests and thresholds."
+    "Verdicts are at 0.05 for each claim. p is one-sided and counts the parts, the next columns count all eight "
+    "claims; docs/claims.md has the tests."
 )
 
 
@@ -56,8 +56,9 @@ def claims(
     """Judge the paper's claims C1 to C8 by the stored runs: supported, contradicted or inconclusive.
 
     Prints a table of the verdicts, and of the claims that are named what each is decided by. Each part of a claim has a
-    statistic and an exact test at 0.05, both fixed beforehand (docs/claims.md), and is also corrected for all eight
-    claims by Holm's method. Every seed counts. CSV has a row for each part, JSON everything.
+    statistic and an exact rank test, both fixed beforehand (docs/claims.md), and the verdict is also corrected for all
+    eight claims by Holm's method. Parts beside a claim compare with other methods and decide nothing. Every seed
+    counts. CSV has a row for each part, JSON everything.
     """
     from ssmail.paper.judgement import judge
 
@@ -117,7 +118,7 @@ def _as_json(found: "Judgement") -> dict[str, Any]:
         "settings": found.settings,
         "runs": found.runs,
         "notes": found.notes,
-        "parts": [_part_value(part) for part in decision.parts],
+        "parts": [_part_value(part) for part in decision.every_part],
     }
 
 
@@ -125,6 +126,7 @@ def _part_value(part: "Part") -> dict[str, Any]:
     return {
         "statement": part.statement,
         "verdict": part.verdict.value,
+        "beside": part.beside,
         "effect": part.effect.value,
         "low": part.effect.low,
         "high": part.effect.high,
@@ -144,7 +146,7 @@ def _part_rows(found: "Judgement") -> Iterator[dict[str, Any]]:
     decision = found.decision
     verdict = {"claim_verdict": found.verdict.value, "claim_p": decision.p, "claim_p_holm": found.p_holm}
     claim = {"claim": found.claim.name, "alias": found.claim.alias, **verdict}
-    yield from (claim | _part_value(part) for part in decision.parts)
+    yield from (claim | _part_value(part) for part in decision.every_part)
 
 
 def _claim_lines(found: "Judgement") -> list[str]:
@@ -152,6 +154,10 @@ def _claim_lines(found: "Judgement") -> list[str]:
     lines = _wrapped(f"{claim.name} {claim.alias} (section {claim.section}, {claim.figure}): {found.verdict}", 0)
     lines += _wrapped(claim.sentence, 2)
     for part in found.decision.parts:
+        lines += _part_lines(part)
+    if found.decision.beside:
+        lines += _wrapped("beside the claim, without a part in its verdict:", 2)
+    for part in found.decision.beside:
         lines += _part_lines(part)
     if found.runs:
         lines += _wrapped(f"runs of profile {found.settings}: {' '.join(run[:8] for run in found.runs)}", 2)

@@ -25,7 +25,7 @@ def beta(db: Path) -> Path:
         for seed, error in enumerate(errors):
             writer = store.start_run(specs[value], seed, dataset_hash="d" * 64, device="cpu")
             writer.epoch(1, {"train/mode_mse": error})
-            writer.final(1, {"test/mode_mse": error})
+            writer.final(1, {"test/mode_mse": error, "test_last/mode_mse": error})
             writer.finish(RunState.FINISHED)
     store.close()
     return db
@@ -51,11 +51,12 @@ def test_csv_has_a_row_for_each_part(cli: CommandLine, beta: Path) -> None:
     found = cli("claims", "--db", beta)
     assert found.code == 0
     assert [row["claim"] for row in found.rows] == [
-        c for c, n in zip("12345678", (5, 3, 3, 4, 2, 2, 3, 2), strict=True) for c in [f"C{c}"] * n
+        c for c, n in zip("12345678", (4, 4, 6, 4, 2, 2, 2, 2), strict=True) for c in [f"C{c}"] * n
     ]
     supported = [row for row in found.rows if row["verdict"] == "supported"]
     assert {row["claim"] for row in supported} == {"C3"}
     assert {row["claim_verdict"] for row in supported} == {"supported"}
+    assert {row["beside"] for row in found.rows} == {"False"}
     assert json.loads(supported[0]["samples"])[1]["label"] == "beta 0"
     assert "C3: missing of curriculum.beta" in found.err
 
@@ -79,9 +80,29 @@ def test_named_claims_are_told_with_every_seed_and_what_is_missing(
     text = " ".join(found.out.split())
     assert "C3 beta (section 4.5, fig6): supported" in text
     assert "beta 0.15, seed by seed: 0: 0.002, 1: 0.0021, 2: 0.0022, 3: 0.0023, 4: 0.0024" in text
-    assert "gail does not converge: inconclusive, no runs of gail" in text
+    unknown = "unknown for seeds 0, 1, 2, 3, 4 of ssail, without a stored validation/mode_mse"
+    assert f"ssail ends with a lower error than gail: inconclusive, {unknown}" in text
+    assert "; no runs of gail" in text
+    assert "beside the claim" not in text
     assert "next: ssmail reproduce --only fig8 --profile quick --seeds 0-4" in text
     assert "C3: missing of curriculum.beta" in found.err
+
+
+def test_what_stands_beside_a_claim_is_told_apart(cli: CommandLine, beta: Path) -> None:
+    store = Store.open(beta)
+    for seed in range(5):
+        spec = ablation_specs("beta", "smoke", values=[0.02])[0.02]
+        writer = store.start_run(spec, seed, dataset_hash="d" * 64, device="cpu")
+        writer.epoch(1, {"train/mode_mse": 0.001})
+        writer.final(1, {"test/mode_mse": 0.001, "test_last/mode_mse": 0.001})
+        writer.finish(RunState.FINISHED)
+    store.close()
+    text = " ".join(cli("claims", "C3", "--format", "table", "--db", beta).out.split())
+    first, _, rest = text.partition("beside the claim, without a part in its verdict: ")
+    worse = "at the selected epoch beta 0.15 has a lower error than beta 0.02: contradicted"
+    assert (worse in first, worse in rest, "C3 beta (section 4.5, fig6): supported" in first) == (False, True, True)
+    (claim,) = json.loads(cli("claims", "--json", "C3", "--db", beta).out)
+    assert [part["beside"] for part in claim["parts"]] == [False] * 6 + [True] * 4
 
 
 @pytest.mark.parametrize("width", [40, 70, 120])

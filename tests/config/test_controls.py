@@ -162,7 +162,7 @@ def test_what_a_control_varies_cannot_be_set(tmp_path: Path, override: str) -> N
 
 
 def test_the_keys_of_an_arm_are_all_that_it_changes() -> None:
-    """The shipped arms of one method differ in the keys of their settings alone."""
+    """The shipped arms of one method differ in the keys of their settings alone, the profile's included."""
     experiments = load_experiments()
     for name in experiments.controls:
         arms = experiments.controls[name]["arms"]
@@ -170,4 +170,6 @@ def test_the_keys_of_an_arm_are_all_that_it_changes() -> None:
             plain = flatten(build_spec(spec.method, spec.environment, "quick").model_dump(mode="json"))
             own = flatten(spec.model_dump(mode="json"))
             changed = {key for key, value in own.items() if plain.get(key) != value}
-            assert changed <= set(flatten(arms[arm].get("settings", {}))), (name, arm)
+            of_profile = experiments.profiles["quick"].get("controls", {}).get(name, {}).get(arm, {})
+            given = {*flatten(arms[arm].get("settings", {})), *flatten(of_profile)}
+            assert changed <= given, (name, arm)

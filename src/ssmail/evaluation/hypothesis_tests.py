@@ -13,22 +13,20 @@ and of 3 against 3 it is 2/20 = 0.1. Every permutation test reports its own (`Pe
 """
 
 import math
-from itertools import chain, combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from scipy.special import bdtr, ndtri  # scipy.stats takes a second to import
 
-from ssmail.data.trajectories import Floats
+from ssmail.data.trajectories import Floats, Integers
 from ssmail.evaluation.statistics import as_table
 
 Alternative = Literal["two-sided", "less", "greater"]
 
 ALPHA = 0.05
-SEEDS_FOR_EVERY = math.ceil(-math.log2(ALPHA))  # so many of so many show that most seeds succeed: 2 ** -n <= ALPHA
 POWER = 0.8  # the probability with which a planned test at ALPHA decides
-MAX_SPLITS = 200_000  # that a permutation test enumerates: 10 against 10 runs
+MAX_SPLITS = 200_000  # that a permutation test counts: 10 against 10 runs
 MAX_SEEDS = 1000  # beyond which a planned test counts as out of reach
 
 
@@ -101,7 +99,7 @@ def permutation_test(
 ) -> PermutationTest:
     """Exact test of the difference between two independent groups on midranks (Wilcoxon, Mann and Whitney).
 
-    All C(R1 + R2, R1) splits of the pooled values, which may be +-inf, are enumerated. With d the rank sum of the first
+    All C(R1 + R2, R1) splits of the pooled values, which may be +-inf, are counted. With d the rank sum of the first
     group less its expectation, p is the share of splits with a d >= the observed one ("greater"), <= it ("less"), or as
     large in size ("two-sided"), ties included. Raises ValueError for an empty group, NaN, and more than MAX_SPLITS
     splits.
@@ -112,12 +110,23 @@ def permutation_test(
     if pooled.ndim != 1 or np.isnan(pooled).any():
         raise ValueError("a permutation test needs one known number per run")
     if splits > MAX_SPLITS:
-        raise ValueError(f"{splits} splits are too many to enumerate; {MAX_SPLITS} are the most")
-    chosen = np.fromiter(chain.from_iterable(combinations(range(len(pooled)), len(a))), dtype=np.intp)
-    sums = midranks(pooled)[chosen.reshape(splits, len(a))].sum(axis=1)  # the observed split first; exact halves
-    excess = sums - len(a) * (len(pooled) + 1) / 2
+        raise ValueError(f"{splits} splits are too many to count; {MAX_SPLITS} are the most")
+    doubled = (2 * midranks(pooled)).astype(np.int64)  # whole numbers
+    counts = _doubled_sums(doubled, len(a))
+    excess = np.arange(len(counts)) - len(a) * (len(pooled) + 1)
     extremity = {"two-sided": np.abs(excess), "greater": excess, "less": -excess}[alternative]
-    return PermutationTest(*(float(np.mean(extremity >= bound)) for bound in (extremity[0], extremity.max())))
+    bounds = extremity[doubled[: len(a)].sum()], extremity[counts > 0].max()
+    return PermutationTest(*(float(counts[extremity >= bound].sum() / splits) for bound in bounds))
+
+
+def _doubled_sums(doubled: Integers, size: int) -> Floats:
+    """Count the subsets with `size` members of the doubled ranks (R,) by their sum: (sum of all + 1,)."""
+    counts = np.zeros((size + 1, int(doubled.sum()) + 1))  # of the subsets of the ranks seen so far, by size and sum
+    counts[0, 0] = 1
+    for rank in doubled:
+        counts[1:, rank:] += counts[:-1, :-rank].copy()
+    found: Floats = counts[size]
+    return found
 
 
 def midranks(values: npt.ArrayLike) -> Floats:
@@ -130,7 +139,7 @@ def midranks(values: npt.ArrayLike) -> Floats:
 def rank_test(first: npt.ArrayLike, second: npt.ArrayLike) -> OneSided:
     """Test whether `first` (R1,) is less or greater than `second` (R2,): the test of Wilcoxon, Mann and Whitney.
 
-    Exact with midranks for ties while the splits can be enumerated. For larger groups (more than 10 against 10 runs),
+    Exact with midranks for ties while the splits can be counted. For larger groups (more than 10 against 10 runs),
     the normal approximation with corrections for ties and continuity.
     """
     a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)

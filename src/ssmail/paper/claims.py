@@ -1,7 +1,7 @@
 """Claims, the samples and tested parts that decide them, and the verdict that follows from the parts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -35,6 +35,7 @@ class Sample:
     seeds: tuple[int, ...] = ()
     values: tuple[float, ...] = ()
     runs: tuple[str, ...] = ()  # ids
+    not_stored: tuple[str, ...] = ()  # metrics and arrays for want of which values are unknown
 
     @property
     def unknown(self) -> tuple[int, ...]:
@@ -44,7 +45,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Part:
-    """A statement that one hypothesis test decides."""
+    """A statement that one hypothesis test decides. One that stands beside its claim has no part in the verdict."""
 
     statement: str
     statistic: str  # the number that is computed from each run
@@ -56,6 +57,7 @@ class Part:
     p_against: float  # one-sided p of the opposite test; 1 without data
     reason: str = ""  # why nothing could be tested
     seeds: int | None = None  # seeds per group that the power calculation asks for; None: no number would do
+    beside: bool = False
 
     @property
     def verdict(self) -> Verdict:
@@ -79,17 +81,26 @@ class Part:
 
 @dataclass(frozen=True)
 class Decision:
-    """The verdict on a claim, from its parts."""
+    """The verdict on a claim, from its parts, and what stands beside it."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # that decide
+    beside: tuple[Part, ...] = ()
+
+    @classmethod
+    def of(cls, parts: Iterable[Part]) -> "Decision":
+        """Tell the parts that decide from those that stand beside the claim."""
+        every = tuple(parts)
+        return cls(tuple(p for p in every if not p.beside), tuple(p for p in every if p.beside))
+
+    @property
+    def every_part(self) -> tuple[Part, ...]:
+        """The parts that decide, and then those that do not."""
+        return self.parts + self.beside
 
     @property
     def verdict(self) -> Verdict:
-        """Supported when all parts are, contradicted when any part is, otherwise inconclusive."""
-        found = {part.verdict for part in self.parts}
-        if Verdict.CONTRADICTED in found:
-            return Verdict.CONTRADICTED
-        return Verdict.SUPPORTED if found == {Verdict.SUPPORTED} else Verdict.INCONCLUSIVE
+        """Supported when all parts are, contradicted when one of them is at ALPHA over their number."""
+        return self.corrected(self.p)
 
     @property
     def p_for(self) -> float:
@@ -108,11 +119,15 @@ class Decision:
 
     @property
     def more_seeds(self) -> int | None:
-        """What the neediest part needs: 0 when the claim is settled, None when no number is expected to settle it."""
+        """How many more seeds should settle the claim: 0 when it is settled, None when no number is expected to.
+
+        To be supported it needs what its neediest part needs. Where a part is contradicted, but not at ALPHA over the
+        number of parts, it needs one more at least: what this part would need at that level is not calculated.
+        """
         if self.verdict is not Verdict.INCONCLUSIVE:
             return 0
         needed = [part.more_seeds for part in self.parts]
-        return None if None in needed else max(number for number in needed if number is not None)
+        return None if None in needed else max(1, *(number for number in needed if number is not None))
 
     def corrected(self, adjusted: float) -> Verdict:
         """The verdict at an adjusted p of the claim (see `holm`)."""

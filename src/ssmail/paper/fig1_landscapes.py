@@ -16,7 +16,8 @@ thresholds.
 Deviation: ssail is trained as in A.2 (alpha in [-1, 1.5], reward 0 above 1) only if experiments.yaml says so for the
 environment that is drawn.
 
-Claim C7: GAIL's reward is nearly flat, SS-AIL's slopes towards the expert everywhere. A slope is usable when it is at
+Claim C7: GAIL's reward is nearly flat, SS-AIL's slopes towards the expert everywhere. ssail is ranked against gail in
+both, without a bar for what is flat; beside the claim stands wail. A slope is usable when it is at
 least a quarter of what an even rise over the plane would have (`ssmail.evaluation.landscape`); the cosine is that
 between the slope and the direction to the expert.
 """
@@ -35,8 +36,8 @@ from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError
 from ssmail.evaluation.landscape import USABLE, Plane, ideal_reward
 from ssmail.paper.claims import Claim, Part, Sample
-from ssmail.paper.hypotheses import median_seed
-from ssmail.paper.samples import LEAST, WORST, Runs
+from ssmail.paper.hypotheses import beside, smaller
+from ssmail.paper.samples import LEAST, WORST, Other, Runs
 from ssmail.paper.typical_seed import typical_runs
 from ssmail.plots import landscape_grids, style
 from ssmail.plots.formatting import listed
@@ -56,9 +57,8 @@ CLAIM = Claim(
     section="1",
     figure=NAME,
 )
-FLAT = 0.5  # of the plane: a reward that has a usable slope on less than this is nearly flat
-EVERYWHERE = 0.9  # of the plane
-TOWARDS = 0.5  # cosine: within 60 degrees
+WAIL = Other("wail", "wail")
+OTHERS = (WAIL,)
 SHARE_STATISTIC = f"{SHARE}: share of the plane where the learned reward has a usable slope, after training"
 COSINE_STATISTIC = f"{COSINE}: mean cosine between that slope and the direction to the expert, after training"
 LIMITS = (-2.5, 2.5)  # of the colours, in standard deviations
@@ -214,22 +214,32 @@ def _number_rows(measured: Measured) -> pd.DataFrame:
     return pd.concat([numbers, pd.DataFrame({"kind": "share", "epoch": last, **named, **shares})])
 
 
-def samples(runs: Runs) -> tuple[Sample, ...]:
-    """Slope shares of gail and of ssail, and cosines of ssail."""
-    return (
-        runs.metric("gail", SHARE, diverged=WORST),
-        runs.metric("ssail", SHARE, diverged=LEAST),
-        runs.metric("ssail", COSINE, diverged=LEAST),
-    )
+def samples(runs: Runs) -> tuple[tuple[Sample, ...], ...]:
+    """Slope shares and cosines, each of ssail, gail and wail."""
+
+    def of_each(name: str) -> tuple[Sample, ...]:
+        others = (runs.metric(method, name, diverged=WORST) for method in ("gail", WAIL.label))
+        return runs.metric("ssail", name, diverged=LEAST), *others
+
+    return of_each(SHARE), of_each(COSINE)
 
 
-def decide(share_gail: Sample, share_ssail: Sample, cosine_ssail: Sample) -> tuple[Part, ...]:
+def decide(shares: Sequence[Sample], cosines: Sequence[Sample]) -> tuple[Part, ...]:
     """Decide C7 from its `samples`."""
-    return (
-        median_seed("gail's reward is nearly flat", SHARE_STATISTIC, share_gail, "below", FLAT),
-        median_seed("ssail's reward has a slope everywhere", SHARE_STATISTIC, share_ssail, "above", EVERYWHERE),
-        median_seed("ssail's reward slopes towards the expert", COSINE_STATISTIC, cosine_ssail, "above", TOWARDS),
-    )
+
+    def against(index: int) -> tuple[Part, ...]:
+        other = shares[index].label
+        return (
+            smaller(f"more of ssail's reward has a slope than of {other}'s", SHARE_STATISTIC, shares[index], shares[0]),
+            smaller(
+                f"ssail's reward points to the expert better than {other}'s",
+                COSINE_STATISTIC,
+                cosines[index],
+                cosines[0],
+            ),
+        )
+
+    return (*against(1), *beside(*against(2)))
 
 
 def draw(record: LandscapesRecord) -> Figure:

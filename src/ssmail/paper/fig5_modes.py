@@ -10,10 +10,9 @@ are cut there and counted.
 
 Deviation: the paper shows one set of trajectories for each method; here every seed has its panel.
 
-Claim C2: SS-AIL ends on either lane, DNRI averages over the lanes. To average is to end nearer to the middle between
-the two continuations of a start than to either of them. A policy that always takes the same lane does not tell the
-modes apart either, so both lanes have to be used. Its rule was fixed when there was no `test/on_path`, and so it reads
-`test/on_lane`, which looks at the end of a path only.
+Claim C2: SS-AIL tells the lanes apart, DNRI averages over them. To average is to end nearer to the middle between the
+two continuations of a start than to either of them. Who tells the lanes apart stays on the path, and takes both lanes.
+All of this is asked of ssail against dnri, of the selected and of the last epoch. Beside the claim stands gail.
 """
 
 from collections.abc import Sequence
@@ -29,8 +28,8 @@ from matplotlib.patches import Patch
 from ssmail.data.trajectories import Booleans, Floats, Integers
 from ssmail.evaluation.metrics import ON_PATH_TOLERANCE, nearest_mode, path_distances, stays_on_path
 from ssmail.paper.claims import Claim, Part, Sample
-from ssmail.paper.hypotheses import median_seed
-from ssmail.paper.samples import LEAST, Runs
+from ssmail.paper.hypotheses import beside, smaller
+from ssmail.paper.samples import LEAST, WORST, Array, Other, Runs
 from ssmail.plots import style
 from ssmail.plots.landscape_grids import path_rows
 from ssmail.plots.provenance import Provenance
@@ -38,11 +37,12 @@ from ssmail.plots.road import draw_strip, lengthened
 from ssmail.plots.run_groups import Reads, Selection, check_settled
 from ssmail.store import RunRow, RunState, Store
 from ssmail.store.comparison import known_values
-from ssmail.store.computed_metrics import centre_lines
+from ssmail.store.computed_metrics import centre_lines, lanes_of
 
 NAME = "fig5"
 STARTS = 16
-ON_LANE, LANE_BALANCE, ON_PATH = "test/on_lane", "test/lane_balance", "test/on_path"
+LANE_BALANCE, ON_PATH = "test/lane_balance", "test/on_path"
+LAST_BALANCE, LAST_ON_PATH = "test_last/lane_balance", "test_last/on_path"
 ROLLOUTS, LANES, CENTRES = "test/rollouts", "test/lanes", "lane_centres"
 CLAIM = Claim(
     name="C2",
@@ -51,11 +51,19 @@ CLAIM = Claim(
     section="4.3",
     figure=NAME,
 )
-ENDS_ON_LANE = 0.9  # of the agents
-TAKES_BOTH_LANES = 0.1  # of the rollouts take the rarer lane
-AVERAGES = 0.5  # of the agents
-ON_LANE_STATISTIC = f"{ON_LANE}: share of agents of sampled test rollouts that end on a lane"
-BALANCE_STATISTIC = f"{LANE_BALANCE}: share of sampled test rollouts that take the rarer lane"
+GAIL = Other("gail", "gail")
+OTHERS = (GAIL,)
+AT_BEST, AT_LAST = "the selected epoch", "the last epoch"
+PATH_STATISTIC = (
+    f"share of agents of sampled test rollouts that stay within {ON_PATH_TOLERANCE:g} step length of a lane's centre "
+    "line on their whole path"
+)
+STRICT = {
+    AT_BEST: f"{ON_PATH}: {PATH_STATISTIC}; where a run did not store it, of the rollouts that it stored",
+    AT_LAST: f"{LAST_ON_PATH}: {PATH_STATISTIC}",
+}
+BALANCE_STATISTIC = "share of sampled test rollouts that take the rarer lane"
+BALANCED = {AT_BEST: f"{LANE_BALANCE}: {BALANCE_STATISTIC}", AT_LAST: f"{LAST_BALANCE}: {BALANCE_STATISTIC}"}
 BETWEEN_STATISTIC = (
     "share of agents of the test rollouts that figure 5 shows that end, along the line between the expert's two "
     "continuations of their start, nearer to its middle than to either end"
@@ -230,22 +238,60 @@ def share_between(rollouts: Floats, lanes: Floats) -> float:
         return float(np.mean(np.abs(place - 0.5) < 0.25))
 
 
-def samples(runs: Runs) -> tuple[Sample, ...]:
-    """on_lane and lane_balance of ssail, and the share of dnri's agents that end between the lanes."""
-    return (
-        runs.metric("ssail", ON_LANE, diverged=LEAST),
-        runs.metric("ssail", LANE_BALANCE, diverged=LEAST),
-        runs.computed("dnri", runs.array, [ROLLOUTS, LANES], share_between, diverged=LEAST),
-    )
+def samples(runs: Runs) -> tuple[tuple[Sample, ...], ...]:
+    """Shares between the lanes of ssail and dnri; shares on the path and lane balances of ssail, dnri and gail.
+
+    The latter of the selected and of the last epoch.
+    """
+
+    def of_each(name: str) -> tuple[Sample, ...]:
+        rest = (runs.metric(method, name, diverged=WORST) for method in ("dnri", GAIL.label))
+        return runs.metric("ssail", name, diverged=LEAST), *rest
+
+    def read(run: RunRow, name: str) -> Array:
+        stored = runs.array(run, name)
+        if name != LANES or len(stored):
+            return stored
+        lanes = lanes_of(runs.store, run, runs.array(run, ROLLOUTS))
+        return stored if lanes is None else np.asarray(lanes)
+
+    def between(method: str, diverged: float) -> Sample:
+        return runs.computed(method, read, [ROLLOUTS, LANES], share_between, diverged=diverged)
+
+    metrics = map(of_each, (ON_PATH, LAST_ON_PATH, LANE_BALANCE, LAST_BALANCE))
+    return (between("ssail", WORST), between("dnri", LEAST)), *metrics
 
 
-def decide(on_lane: Sample, balance: Sample, between: Sample) -> tuple[Part, ...]:
+def decide(
+    between: Sequence[Sample],
+    path: Sequence[Sample],
+    last_path: Sequence[Sample],
+    balance: Sequence[Sample],
+    last_balance: Sequence[Sample],
+) -> tuple[Part, ...]:
     """Decide C2 from its `samples`."""
-    return (
-        median_seed("ssail ends on a lane", ON_LANE_STATISTIC, on_lane, "above", ENDS_ON_LANE),
-        median_seed("ssail takes both lanes", BALANCE_STATISTIC, balance, "above", TAKES_BOTH_LANES),
-        median_seed("dnri ends between the lanes", BETWEEN_STATISTIC, between, "above", AVERAGES),
-    )
+
+    def strict(when: str, ours: Sample, other: Sample) -> Part:
+        return smaller(
+            f"at {when} more of ssail's agents stay on the path than of {other.label}'s", STRICT[when], other, ours
+        )
+
+    def even(when: str, ours: Sample, other: Sample) -> Part:
+        return smaller(
+            f"at {when} ssail takes the two lanes more evenly than {other.label}", BALANCED[when], other, ours
+        )
+
+    def against(index: int) -> tuple[Part, ...]:
+        return (
+            strict(AT_BEST, path[0], path[index]),
+            strict(AT_LAST, last_path[0], last_path[index]),
+            even(AT_LAST, last_balance[0], last_balance[index]),
+            even(AT_BEST, balance[0], balance[index]),
+        )
+
+    *of_dnri, balance_at_best = against(1)
+    fewer = "fewer of ssail's agents than of dnri's end between the lanes"
+    return (smaller(fewer, BETWEEN_STATISTIC, *between), *of_dnri, *beside(balance_at_best, *against(2)))
 
 
 def draw(record: ModesRecord) -> Figure:

@@ -19,7 +19,7 @@ Deviation: the paper's figure shows only Noisy Mocap; this one can be drawn for 
 
 Claim C5: negative alpha lowers the final error and lets training converge sooner. The claim's "training loss" is taken
 to be the error of the upper panel, for the reason given above. Both ranges have to reach the same level, which favours
-neither.
+neither. Beside the claim stands the test error of the selected epoch.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,8 +32,8 @@ from matplotlib.figure import Figure
 from ssmail.data.trajectories import Floats
 from ssmail.evaluation.statistics import Statistic
 from ssmail.paper.claims import Claim, Part, Sample
-from ssmail.paper.hypotheses import smaller
-from ssmail.paper.samples import WORST, Runs, end_mean
+from ssmail.paper.hypotheses import beside, smaller
+from ssmail.paper.samples import WORST, Other, Runs, end_mean
 from ssmail.plots import curve_notes, curves, style
 from ssmail.plots.curves import Band, constant_velocity
 from ssmail.plots.formatting import setting
@@ -60,9 +60,12 @@ CLAIM = Claim(
     section="4.7",
     figure=NAME,
 )
+OTHERS: tuple[Other, ...] = ()
 BOTH, POSITIVE = (-1.0, 1.0), (0.0, 1.0)  # what alpha is drawn from
 LEVEL = 2.0  # times the median final error of all runs of both ranges
 FINAL = "train/mse, mean of the last fifth of the epochs, squared scaled units"
+SELECTED = "test/mse"
+SELECTED_STATISTIC = f"{SELECTED} of the model of best validation, squared scaled units"
 EPOCHS = "epochs until train/mse stays at or below twice the median final error of all runs of both ranges"
 
 
@@ -132,27 +135,29 @@ def epochs_to_converge(errors: Floats, level: float) -> float:
     return float(above[-1] + 2) if above[-1] + 1 < len(errors) else np.inf
 
 
-def samples(runs: Runs) -> tuple[Sample, ...]:
-    """Final errors with alpha drawn from BOTH and from POSITIVE, and the epochs that each takes to converge."""
+def samples(runs: Runs) -> tuple[tuple[Sample, ...], ...]:
+    """Final errors, epochs to converge and errors of the selected epoch, each with alpha from BOTH and POSITIVE."""
 
-    def of_each_range(number: Callable[[Floats], float]) -> list[Sample]:
-        return [
+    def of_each_range(number: Callable[[Floats], float]) -> tuple[Sample, ...]:
+        return tuple(
             runs.computed(alpha, runs.curve, ["train/mse"], number, diverged=WORST, label=f"alpha {setting(alpha)}")
             for alpha in (BOTH, POSITIVE)
-        ]
+        )
 
     finals = of_each_range(end_mean)
     level = common_level([value for sample in finals for value in sample.values])
-    return (*finals, *of_each_range(lambda errors: epochs_to_converge(errors, level)))
+    selected = tuple(
+        runs.metric(alpha, SELECTED, diverged=WORST, label=f"alpha {setting(alpha)}") for alpha in (BOTH, POSITIVE)
+    )
+    return finals, of_each_range(lambda errors: epochs_to_converge(errors, level)), selected
 
 
-def decide(
-    final_both: Sample, final_positive: Sample, epochs_both: Sample, epochs_positive: Sample
-) -> tuple[Part, ...]:
+def decide(finals: Sequence[Sample], epochs: Sequence[Sample], selected: Sequence[Sample]) -> tuple[Part, ...]:
     """Decide C5 from its `samples`."""
     return (
-        smaller("negative alpha lowers the final error", FINAL, final_both, final_positive),
-        smaller("negative alpha converges sooner", EPOCHS, epochs_both, epochs_positive),
+        smaller("negative alpha lowers the final error", FINAL, *finals),
+        smaller("negative alpha converges sooner", EPOCHS, *epochs),
+        *beside(smaller("negative alpha lowers the error of the selected epoch", SELECTED_STATISTIC, *selected)),
     )
 
 

@@ -1,24 +1,24 @@
-"""The four kinds of hypotheses that claims are made of, each with its test, its effect and its power calculation.
+"""The three kinds of hypotheses that claims are made of, each with its test, its effect and its power calculation.
 
-A hypothesis stays untested where a sample has no runs or an unknown value; the part then states the reason.
+Two of them compare two groups. The third compares one group with zero, where zero is what no effect would give. A
+hypothesis stays untested where a sample has no runs or an unknown value; the part then states the reason.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ssmail.evaluation import hypothesis_tests
 from ssmail.evaluation.hypothesis_tests import (
-    SEEDS_FOR_EVERY,
     UNKNOWN,
     Estimate,
     seeds_for_rank_test,
     seeds_for_sign_test,
 )
 from ssmail.paper.claims import Part, Sample
-
-Side = Literal["below", "above"]
 
 LEAST_FOR_SPREAD = 2  # seeds: a single one has no spread
 
@@ -33,40 +33,26 @@ class _Tested(NamedTuple):
     seeds: int | None
 
 
-def every_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
-    """Test that every seed of a method is below (above) the bar: one counterexample contradicts it.
-
-    n of n seeds support it once they rule out that only half of all seeds are: p = 2 ** -n, from five seeds on.
-    """
+def above_zero(statement: str, statistic: str, sample: Sample) -> Part:
+    """Test that the median over all seeds is above zero, with a sign test."""
 
     def tested() -> _Tested:
-        inside = _inside(sample, side, bar)
-        p = (0.5**inside, 1.0) if inside == len(sample.values) else (1.0, 0.0)
-        return _Tested(*_median(sample, side, bar), *p, SEEDS_FOR_EVERY)
+        above = int((np.array(sample.values) > 0).sum())
+        less, greater = hypothesis_tests.sign_test(sample.values, 0.0)
+        what = f"median ({above} of {len(sample.values)} seeds above 0)"
+        needed = seeds_for_sign_test(above / len(sample.values))
+        return _Tested(hypothesis_tests.median(sample.values), what, greater, less, needed)
 
-    test = f"every seed {side} {bar:g}: exact binomial test against half of them; one seed that is not contradicts"
-    return _part(statement, statistic, test, (sample,), tested)
-
-
-def median_seed(statement: str, statistic: str, sample: Sample, side: Side, bar: float) -> Part:
-    """Test that the median over all seeds of a method is below (above) the bar, with a sign test."""
-
-    def tested() -> _Tested:
-        found = hypothesis_tests.sign_test(sample.values, bar)
-        p = (found.less, found.greater) if side == "below" else (found.greater, found.less)
-        needed = seeds_for_sign_test(_inside(sample, side, bar) / len(sample.values))
-        return _Tested(*_median(sample, side, bar), *p, needed)
-
-    return _part(statement, statistic, f"exact sign test of the median, {side} {bar:g}", (sample,), tested)
+    return _part(statement, statistic, "exact sign test of the median, above 0", (sample,), tested)
 
 
 def smaller(statement: str, statistic: str, small: Sample, great: Sample) -> Part:
-    """Test that runs of `small` have smaller values than those of `great`: rank test, Hodges-Lehmann shift."""
+    """Test that runs of `small` have smaller values than those of `great`: rank test, shift of Hodges and Lehmann."""
 
     def tested() -> _Tested:
         needed = seeds_for_rank_test(hypothesis_tests.superiority(small.values, great.values))
         effect = hypothesis_tests.shift(small.values, great.values)
-        what = f"shift from {small.label} to {great.label} (Hodges-Lehmann)"
+        what = f"shift from {small.label} to {great.label}; {_ordered(small.values, great.values)}"
         return _Tested(effect, what, *hypothesis_tests.rank_test(small.values, great.values), needed)
 
     return _part(statement, statistic, "exact rank test (Wilcoxon, Mann, Whitney)", (small, great), tested)
@@ -82,7 +68,7 @@ def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> 
     def tested() -> _Tested:
         near, far = hypothesis_tests.deviations(tight.values), hypothesis_tests.deviations(wide.values)
         needed = seeds_for_rank_test(hypothesis_tests.superiority(near, far))
-        what = f"shift of the distance from the median, from {tight.label} to {wide.label} (Hodges-Lehmann)"
+        what = f"shift of the distance from the median, from {tight.label} to {wide.label}; {_ordered(near, far)}"
         seeds = None if needed is None else needed + 1  # for the distance that is left out
         return _Tested(hypothesis_tests.shift(near, far), what, *hypothesis_tests.rank_test(near, far), seeds)
 
@@ -90,15 +76,15 @@ def less_spread(statement: str, statistic: str, tight: Sample, wide: Sample) -> 
     return _part(statement, statistic, test, (tight, wide), tested, least=LEAST_FOR_SPREAD)
 
 
-def _inside(sample: Sample, side: Side, bar: float) -> int:
-    """Count the values strictly beyond the bar on that side."""
-    values = np.array(sample.values)
-    return int((values < bar).sum() if side == "below" else (values > bar).sum())
+def beside(*parts: Part) -> tuple[Part, ...]:
+    """Mark parts that stand beside a claim, as evidence that decides nothing. Those without runs are left out."""
+    return tuple(replace(part, beside=True) for part in parts if part.fewest)
 
 
-def _median(sample: Sample, side: Side, bar: float) -> tuple[Estimate, str]:
-    count = f"{_inside(sample, side, bar)} of {len(sample.values)} seeds"
-    return hypothesis_tests.median(sample.values), f"median ({count} {side} {bar:g})"
+def _ordered(small: npt.ArrayLike, great: npt.ArrayLike) -> str:
+    """Say in how many pairs the hypothesis holds; it is all of them where the worst run beats the other's best."""
+    pairs = np.size(small) * np.size(great)
+    return f"{hypothesis_tests.superiority(small, great) * pairs:g} of {pairs} pairs in order"
 
 
 def _part(
@@ -123,5 +109,6 @@ def _lacking(sample: Sample, least: int) -> str:
         return f"no runs of {sample.label}"
     if sample.unknown:
         several = "s" * (len(sample.unknown) > 1)
-        return f"unknown for seed{several} {', '.join(map(str, sample.unknown))} of {sample.label}"
+        lacks = f", without a stored {' or '.join(sample.not_stored)}" if sample.not_stored else ""
+        return f"unknown for seed{several} {', '.join(map(str, sample.unknown))} of {sample.label}{lacks}"
     return f"{len(sample.seeds)} seed of {sample.label} is too few" if len(sample.seeds) < least else ""

@@ -5,7 +5,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from ssmail.errors import InputError
-from ssmail.paper.results import FIGURES, FigureModule
+from ssmail.paper.results import CLAIMS, FIGURES, FigureModule
+from ssmail.paper.samples import Runs
 from ssmail.plots.data_sets import data_sets, is_own
 from ssmail.plots.series import select
 from ssmail.store import RunRow, Store
@@ -46,6 +47,8 @@ def contents(store: Store, runs: Sequence[RunRow]) -> Contents:
         curves |= set(figure.reads.curves)
         for run_id in _drawn(only, figure, runs, undrawable):
             arrays.setdefault(run_id, {}).update(figure.reads.stored(store.array_names(run_id)))
+    for run_id, name in _beside(only, runs):
+        arrays.setdefault(run_id, {}).setdefault(name, None)
     return Contents(Wanted(frozenset(curves), arrays), undrawable)
 
 
@@ -60,6 +63,15 @@ def _drawn(store: Store, figure: FigureModule, runs: Sequence[RunRow], undrawabl
                 if profile is None and environment is None:
                     undrawable[figure.name] = str(error)
                 yield from _judged(store, figure, profile, environment)
+
+
+def _beside(store: Store, runs: Sequence[RunRow]) -> Iterator[tuple[str, str]]:
+    """Yield the runs that stand beside a claim without being drawn, with each array that the claim reads of them."""
+    for profile in (None, *sorted({run.profile for run in runs})):
+        for figure in (FIGURES[name] for name in CLAIMS):
+            for other, group in Runs.of_figure(store, figure.name, profile, figure.others).beside:
+                for run in group.runs if other.arrays else ():
+                    yield from ((run.id, name) for name in other.arrays if name in store.array_names(run.id))
 
 
 def _judged(store: Store, figure: FigureModule, profile: str | None, environment: str | None) -> Iterator[str]:

@@ -1,8 +1,9 @@
 """The nine figures of the paper and the eight claims that are read off them.
 
 Each figure has a module. Its `collect(store, selection)` returns a frozen record of what is shown, and `draw(record)` a
-matplotlib Figure. Where a claim is read off the figure, the module also has the CLAIM, `samples(runs)`, which reads its
-numbers from the store, and `decide(*samples)`, which tests them. Importing this table imports neither matplotlib nor
+matplotlib Figure. Where a claim is read off the figure, the module also has the CLAIM, the OTHERS that the figure does
+not draw but the claim looks at, `samples(runs)`, which reads its numbers from the store, and `decide(*samples)`, which
+tests them. Importing this table imports neither matplotlib nor
 pandas: a figure's module is imported when it is used.
 """
 
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
     from ssmail.evaluation.statistics import Statistic
     from ssmail.paper.claims import Claim, Part
-    from ssmail.paper.samples import Runs
+    from ssmail.paper.samples import Other, Runs
     from ssmail.plots.run_groups import Reads
     from ssmail.store import Store
 
@@ -83,8 +84,13 @@ class FigureModule:
         """The claim that is read off the figure; only those of CLAIMS have one."""
         return cast("Claim", self._module().CLAIM)
 
+    @property
+    def others(self) -> "tuple[Other, ...]":
+        """The methods that the figure does not draw and that stand beside its claim."""
+        return cast("tuple[Other, ...]", self._module().OTHERS)
+
     def decide(self, runs: "Runs") -> "tuple[Part, ...]":
-        """Test the parts of the claim on the figure's runs."""
+        """Test the parts of the claim on the figure's runs, and what stands beside it."""
         module = self._module()
         with stored_values(self.name):
             return cast("tuple[Part, ...]", module.decide(*module.samples(runs)))

@@ -173,6 +173,12 @@ def figure_ablation(figure: str) -> Ablation:
     return found
 
 
+def fullest_spec(runs: Sequence[RunRow]) -> tuple[RunRow, ...]:
+    """Return the settled runs of the spec that is drawn of one method: see above. Empty without any."""
+    families = [Family(tuple(found), _gives_now(found[0])) for found in by_spec(runs)]
+    return max(families, key=lambda family: family.rank).runs if families else ()
+
+
 def train_command(method: str, environment: str, profile: str | None = None) -> str:
     """Return the command that trains runs of this method."""
     options = ("--method", method, "--env", environment, "--profile", profile or "quick")
@@ -212,12 +218,20 @@ def _families(needed: _Comparison, stored: Sequence[RunRow]) -> list[Family]:
 
 def _is_current(needed: _Comparison, run: RunRow) -> bool:
     """Whether experiments.yaml gives the run's spec now; an unknown profile or method counts as outdated."""
+    if needed.ablation is None:
+        return _gives_now(run)
     try:
-        if needed.ablation is None:
-            return build_spec(run.method, run.environment, run.profile).hash() == run.spec_hash
         name, value = needed.ablation.name, value_of(run, needed.ablation.key)
         specs = ablation_specs(name, run.profile, values=[value], environment=needed.environment)
         return run.spec_hash in {spec.hash() for spec in specs.values()}
+    except InputError:
+        return False
+
+
+def _gives_now(run: RunRow) -> bool:
+    """Whether `ssmail train` would give the run's method this spec now."""
+    try:
+        return build_spec(run.method, run.environment, run.profile).hash() == run.spec_hash
     except InputError:
         return False
 

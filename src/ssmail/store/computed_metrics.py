@@ -53,6 +53,14 @@ def centre_lines(store: Store, run: RunRow) -> Any:
     return _Arrays(store).centre_lines(run)
 
 
+def lanes_of(store: Store, run: RunRow, rollouts: Any) -> Any:
+    """Return the expert's continuations (L, B, T, N, 2) of rollouts (S, B, T, N, 2) on the run's data, or None.
+
+    A compact database keeps them of some runs only, so they may be those of another run on the same data.
+    """
+    return _Arrays(store).lanes(run, rollouts.shape[1:])
+
+
 def note(computed: Computed) -> str | None:
     """Return one sentence on what was computed, None if nothing was."""
     if not computed.rollouts:

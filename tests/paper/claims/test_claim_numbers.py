@@ -68,6 +68,10 @@ def test_c4_an_error_that_grows_ever_more_slowly() -> None:
     steps = np.arange(1.0, 9)
     assert bending(np.sqrt(steps)) < 0 < bending(steps**2)
     assert bending(3 * steps) == pytest.approx(0)
+    assert bending(curve(0, 3, 0, 1)) == pytest.approx(-0.5)  # (1 - 3) / (1 + 3)
+    assert bending(1000 * curve(0, 3, 0, 1)) == pytest.approx(-0.5)  # has no unit
+    assert bending(curve(0, 3, 1, 0)) == pytest.approx(-1)
+    assert bending(np.ones(8)) == 0
     assert late_slope(curve(9, 9, 1, 3)) == pytest.approx(2)
     assert math.isnan(bending(np.full(8, math.inf)))
 

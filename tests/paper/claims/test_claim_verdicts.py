@@ -7,7 +7,7 @@ import pytest
 
 from ssmail.evaluation.hypothesis_tests import ALPHA, UNKNOWN, deviations, rank_test
 from ssmail.paper.claims import Decision, Part, Sample, Verdict, holm
-from ssmail.paper.hypotheses import every_seed, less_spread, median_seed, smaller
+from ssmail.paper.hypotheses import above_zero, beside, less_spread, smaller
 
 
 def sample(*values: float, label: str = "ssail") -> Sample:
@@ -29,9 +29,10 @@ SUPPORTED, CONTRADICTED, OPEN = part(0.01, 1), part(1, 0.02), part(0.2, 0.9)
         ([SUPPORTED, CONTRADICTED], Verdict.CONTRADICTED),
         ([OPEN, CONTRADICTED], Verdict.CONTRADICTED),
         ([OPEN], Verdict.INCONCLUSIVE),
+        ([SUPPORTED, OPEN, CONTRADICTED], Verdict.INCONCLUSIVE),  # 3 * 0.02
     ],
 )
-def test_all_parts_support_and_any_contradicts(parts: list[Part], verdict: Verdict) -> None:
+def test_all_parts_support_and_any_contradicts_at_alpha_over_their_number(parts: list[Part], verdict: Verdict) -> None:
     assert Decision(tuple(parts)).verdict is verdict
 
 
@@ -49,6 +50,7 @@ def test_the_neediest_part_says_how_many_more_seeds() -> None:
     assert Decision((part(0.2, 0.9, seeds=8), part(0.3, 0.8, seeds=None))).more_seeds is None
     assert Decision((part(0.2, 0.9, seeds=2),)).more_seeds == 1  # not settled, so one more at least
     assert Decision((SUPPORTED, SUPPORTED)).more_seeds == 0
+    assert Decision((SUPPORTED, SUPPORTED, CONTRADICTED)).more_seeds == 1  # not settled either
 
 
 def test_holm_by_hand() -> None:
@@ -56,26 +58,29 @@ def test_holm_by_hand() -> None:
     assert holm([0.9, 0.8]) == (1.0, 1.0)
 
 
-def test_every_seed_has_to() -> None:
-    assert every_seed("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
-    four = every_seed("", "", sample(1, 2, 3, 4), "below", 6)
-    assert (four.verdict, four.p_for, four.more_seeds) == (Verdict.INCONCLUSIVE, 1 / 16, 1)
-    assert every_seed("", "", sample(1, 2, 3, 4, math.inf), "below", 6).verdict is Verdict.CONTRADICTED
-    assert every_seed("", "", sample(6, 7), "above", 6).verdict is Verdict.CONTRADICTED  # at the bar is not above it
-
-
-def test_the_typical_seed_has_to() -> None:
-    assert median_seed("", "", sample(1, 2, 3, 4, 5), "below", 6).verdict is Verdict.SUPPORTED
-    assert median_seed("", "", sample(1, 2, 3, 4, 5), "above", 6).verdict is Verdict.CONTRADICTED
-    four = median_seed("", "", sample(1, 2, 3, 4, math.inf), "below", 6)
-    assert (four.verdict, four.effect_is) == (Verdict.INCONCLUSIVE, "median (4 of 5 seeds below 6)")
+def test_the_typical_seed_is_above_zero() -> None:
+    assert above_zero("", "", sample(1, 2, 3, 4, 5)).verdict is Verdict.SUPPORTED
+    assert above_zero("", "", sample(-1, -2, -3, -4, -math.inf)).verdict is Verdict.CONTRADICTED
+    four = above_zero("", "", sample(1, 2, 3, 4, -math.inf))
+    assert (four.verdict, four.effect_is) == (Verdict.INCONCLUSIVE, "median (4 of 5 seeds above 0)")
     assert four.more_seeds == 13  # 18 in all: P(X >= 13 | 18, 0.8) = 0.87, and P(X >= 13 | 18, 1/2) = 0.048
+    assert above_zero("", "", sample(0, 1, 2, 3, 4)).p_for == 6 / 32  # at zero is not above it
+
+
+def test_what_stands_beside_has_no_part_in_the_verdict() -> None:
+    (aside,) = beside(CONTRADICTED)
+    found = Decision.of([SUPPORTED, aside])
+    assert (found.parts, found.beside, found.every_part) == ((SUPPORTED,), (aside,), (SUPPORTED, aside))
+    assert (found.verdict, found.p, found.more_seeds) == (Verdict.SUPPORTED, 0.01, 0)
+    assert Decision.of([SUPPORTED, CONTRADICTED]).verdict is Verdict.CONTRADICTED  # the control
+    assert beside(smaller("", "", sample(1), Sample("wail"))) == ()
 
 
 def test_one_group_has_smaller_values() -> None:
     low, high = sample(1, 2, 3, 4, 5), sample(11, 12, 13, 14, math.inf, label="gail")
     found = smaller("", "", low, high)
     assert (found.verdict, found.effect.value) == (Verdict.SUPPORTED, 10.0)
+    assert found.effect_is == "shift from ssail to gail; 25 of 25 pairs in order"
     assert smaller("", "", high, low).verdict is Verdict.CONTRADICTED
     mixed = smaller("", "", sample(1, 3, 5), sample(2, 4, 6))
     assert (mixed.verdict, mixed.seeds) == (Verdict.INCONCLUSIVE, 38)  # 6 of 9 pairs: 1.0304 / (1/6)^2 = 37.1
@@ -102,4 +107,4 @@ def test_what_is_missing_is_told() -> None:
     nothing = smaller("", "", Sample("ssail"), Sample("gail"))
     assert nothing.reason == "no runs of ssail; no runs of gail"
     assert (nothing.verdict, nothing.more_seeds) == (Verdict.INCONCLUSIVE, None)
-    assert median_seed("", "", sample(1, math.nan, math.nan), "below", 3).reason == "unknown for seeds 1, 2 of ssail"
+    assert above_zero("", "", sample(1, math.nan, math.nan)).reason == "unknown for seeds 1, 2 of ssail"

@@ -93,6 +93,10 @@ def test_verdicts_effects_and_every_seed(written: Written) -> None:
         value, low, high = (f"{number:.3g}".replace("inf", "∞") for number in part.effect)
         assert f"{part.statement} ✓ supported" in section.words()
         assert f"{value} [{low}, {high}]" in section.words()
+    for part in c3.decision.beside:  # with the usual beta, which the runs of figure 4 have
+        assert f"beside the claim: {part.statement}" in section.words()
+        assert f"| beside the claim: {part.statement} | {part.verdict} |" in written.markdown
+    assert len(c3.decision.beside) == 4
     for value in (0.0, 0.15, 1.0):
         for seed, error in enumerate(ERRORS[value]):
             assert f"seed {seed}: {error:.3g}" in section.words()

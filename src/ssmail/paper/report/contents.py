@@ -109,7 +109,7 @@ def _nearby(where: str) -> str:
 def samples_of(found: Judgement) -> list[tuple[Part, Sample]]:
     """Return the samples of a claim, each once, with a part that states their statistic."""
     seen: dict[tuple[str, str], tuple[Part, Sample]] = {}
-    for part in found.decision.parts:
+    for part in found.decision.every_part:
         for sample in part.samples:
             seen.setdefault((part.statistic, sample.label), (part, sample))
     return list(seen.values())
