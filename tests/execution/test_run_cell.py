@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from ssmail.config.experiments import build_spec
-from ssmail.data.expert_sets import generate, save
+from ssmail.data.expert_sets import save
+from ssmail.data.yjunction import generate
 from ssmail.execution import Resume
 from ssmail.execution import run_together as module
 from ssmail.execution.cells import Cell, Event, Job, RunSettings
@@ -382,10 +383,10 @@ def test_jobs_and_events_survive_the_way_between_processes(cells: list[Cell]) ->
 def test_a_finished_cell_is_skipped_only_while_its_data_file_is_the_same(store: Store, tmp_path: Path) -> None:
     path = tmp_path / "experts.npz"
     spec = build_spec("ssail", "yjunction", "smoke", [f"data.path={path}", "training.epochs=1"])
-    save(generate(spec.data, 0), path)
+    save(generate(spec.data.yjunction), path)
     assert run(Cell(spec, 0), store, loop=TrainingLoop)[-1].kind == "finished"
     assert run(Cell(spec, 0), store, loop=TrainingLoop)[-1].kind == "skipped"
-    save(generate(spec.data, 5), path, force=True)
+    save(generate(spec.data.yjunction.model_copy(update={"seed": 5})), path, force=True)
     (refused,) = run(Cell(spec, 0), store, loop=TrainingLoop)
     assert (refused.kind, refused.bad_input) == ("failed", True)
     assert "has changed since run" in refused.message
