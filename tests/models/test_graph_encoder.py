@@ -64,6 +64,19 @@ def test_sampled_edge_types_have_the_softmax_as_marginal(shared: str, resample: 
     torch.testing.assert_close(frequency, torch.softmax(logits[0], dim=-1), atol=0.02, rtol=0)
 
 
+def test_without_noise_the_sample_is_the_most_likely_graph() -> None:
+    """And nothing is drawn. Negative control: with noise, other types are sampled."""
+    logits = torch.randn(50, 4, 3, 3, 2, generator=torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(0)
+    before = generator.get_state()
+    noise = GraphNoise("none", "step").draw(50, 4, 3, 2, generator)
+    assert (generator.get_state() == before).all()
+    likely = logits.argmax(-1)
+    assert (sample_graph(logits, noise, 0.5).argmax(-1) == likely).all()
+    noisy = GraphNoise("edge", "step").draw(50, 4, 3, 2, generator)
+    assert (sample_graph(logits, noisy, 0.5).argmax(-1) != likely).any()
+
+
 def test_shared_noise_makes_the_group_commit() -> None:
     """With equal logits all edges and steps of a trajectory take one type under shared noise, and rarely do under
     fresh noise.

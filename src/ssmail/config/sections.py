@@ -229,8 +229,8 @@ class VariationalSpec(Frozen):
     """Number of edge types, the latent classes of an ordered pair of agents."""
     first_type_is_none: bool
     """Edges of the first type carry no messages."""
-    graph_noise: Literal["edge", "shared"]
-    """As model.graph_noise."""
+    graph_noise: Literal["edge", "shared", "none"]
+    """As model.graph_noise; none: the most likely graph instead of a sampled one, in training and afterwards."""
     graph_resample: Literal["step", "trajectory"]
     """dnri: how often the noise of the edge types is resampled, as model.graph_resample; nri has one graph."""
     action_step: Annotated[Positive, Unit("scaled units")] | None

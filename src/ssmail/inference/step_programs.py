@@ -67,9 +67,8 @@ def step_programs(run: TrainedRun, agents: int | None = None, batch: int = 1) ->
             "action_noise": group,
         }
         outputs = ("next_positions", "next_velocities", "next_hidden", "next_cell")
-        each = "step" if policy.graph_noise.resample == "step" else "trajectory"
         meanings = {
-            "graph_noise": f"{GUMBEL}; drawn once per {each}",
+            "graph_noise": _meaning(policy.graph_noise),
             "action_noise": "standard normal noise; zeros act by the mean",
         }
         return {"step": Program(PolicyStep(policy, features, run.scaling), inputs, outputs, _STATE | meanings)}
@@ -101,6 +100,11 @@ def _agents_of(run: TrainedRun) -> int:
 
 def _noise(kind: GraphNoise, batch: int, agents: int, types: int) -> Tensor:
     return kind.draw(batch, 1, agents, types, torch.Generator().manual_seed(0))[:, 0]
+
+
+def _meaning(kind: GraphNoise) -> str:
+    drawn = "once per trajectory" if kind.resample == "trajectory" else "anew at every step"
+    return "zeros" if kind.shared == "none" else f"{GUMBEL}; drawn {drawn}"
 
 
 class PolicyStep(nn.Module):
@@ -213,8 +217,7 @@ def _variational(
         edges = torch.zeros(batch, agents * (agents - 1), model.spec.memory)
         inputs = {**state, "hidden": edges, "cell": edges, "memory": memory, "graph_noise": edge_noise}
         outputs = ("next_positions", "next_velocities", "next_hidden", "next_cell", "next_memory")
-        drawn = "once per trajectory" if model.graph_noise.resample == "trajectory" else "anew at every step"
-        meanings = _STATE | {"graph_noise": f"{GUMBEL}; drawn {drawn}"}
+        meanings = _STATE | {"graph_noise": _meaning(model.graph_noise)}
         return {"step": Program(DynamicStep(model, run.scaling), inputs, outputs, meanings)}
     frames = run.observed or 1
     seen = {name: value.unsqueeze(1).expand(-1, frames, -1, -1).contiguous() for name, value in state.items()}
@@ -222,7 +225,7 @@ def _variational(
     graph_meanings = {
         "positions": f"the {frames} observed frames with velocities, raw units",
         "velocities": "theirs: positions less those of the frame before, raw units",
-        "graph_noise": f"{GUMBEL}; drawn once per trajectory",
+        "graph_noise": _meaning(model.graph_noise),
     }
     return {
         "graph": Program(

@@ -145,15 +145,18 @@ def on_diagonal(edges: Tensor, agents: int) -> Tensor:
 class GraphNoise:
     """Which edges and steps share a draw of Gumbel noise.
 
-    shared: with "shared" all edges of a graph share one draw, with "edge" each has its own.
+    shared: with "shared" all edges of a graph share one draw, with "edge" each has its own; with "none" there is no
+    noise, and the sampled graph is the most likely one.
     resample: with "trajectory" a draw holds for the whole trajectory, with "step" it is renewed at every step.
     """
 
-    shared: Literal["shared", "edge"]
+    shared: Literal["shared", "edge", "none"]
     resample: Literal["trajectory", "step"]
 
     def draw(self, batch: int, steps: int, agents: int, edge_types: int, generator: torch.Generator) -> Tensor:
         """Draw Gumbel noise that broadcasts to (B, T, N, N, K): axes over which it is shared have length 1."""
+        if self.shared == "none":
+            return torch.zeros(batch, 1, 1, 1, edge_types)
         n = 1 if self.shared == "shared" else agents
         t = 1 if self.resample == "trajectory" else steps
         uniform = torch.rand(batch, t, n, n, edge_types, generator=generator)
