@@ -89,8 +89,6 @@ Database = Annotated[
     str,
     typer.Option("--db", envvar="SSMAIL_DB", metavar="PATH|URL", help="The database: a file, or an SQLAlchemy URL."),
 ]
-
-
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, with NaN and infinities as text.")]
 Output = Annotated[
     Format | None,

@@ -99,7 +99,7 @@ def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:
     by_seed: dict[int | None, set[str]] = {}
     for run in runs:
         if run.dataset_hash:
-            by_seed.setdefault(run.seed if _by_seed(run) else None, set()).add(run.dataset_hash)
+            by_seed.setdefault(run.seed if _differs_by_seed(run) else None, set()).add(run.dataset_hash)
     hashes = sorted({value for found in by_seed.values() for value in found})
     if len(hashes) > 1 and (None in by_seed or max(map(len, by_seed.values())) > 1):
         names = ", ".join(value[:8] for value in hashes)
@@ -107,8 +107,8 @@ def check_one_data_set(figure: str, runs: Sequence[RunRow]) -> None:
         raise InputError(f"{figure} would mix runs on different data ({names}); {remedy}.")
 
 
-def _by_seed(run: RunRow) -> bool:
-    """Return whether each seed of the run's spec has data of its own."""
+def _differs_by_seed(run: RunRow) -> bool:
+    """Return whether every seed of the run's spec has data of its own."""
     data = run.spec.get("data")
     generator = data.get(run.environment) if isinstance(data, Mapping) and data.get("path") is None else None
     return isinstance(generator, Mapping) and generator.get("seed", 0) is None

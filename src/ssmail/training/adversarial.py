@@ -35,7 +35,7 @@ from ssmail.training.agent_numbers import replay_buffers, replay_name
 from ssmail.training.batches import Batch
 from ssmail.training.checkpoint import Stateful
 from ssmail.training.curricula import curriculum_metrics, draw_interventions, intervention_frequency
-from ssmail.training.learner import LearnerContext
+from ssmail.training.learner import LearnerContext, experts_of_seeds
 from ssmail.training.optimization import LearningRateSchedule, add_noise
 from ssmail.training.rollout import PolicyPredictor
 from ssmail.training.seeding import GeneratorsOfSeeds, drawn
@@ -157,14 +157,6 @@ def input_noise(spec: AdversarialSpec, epoch: int, epochs: int) -> float:
     passed = (epoch / max(epochs - 1, 1) - spec.input_noise_start) / (1 - spec.input_noise_start)
     falling: float = spec.input_noise_final ** max(passed, 0.0)
     return spec.input_noise * falling
-
-
-def experts_of_seeds(contexts: Sequence[LearnerContext]) -> tuple[Batch, ...]:
-    """Return the training split for each number of agents: what all seeds share, or side by side what each has."""
-    of_each = [context.by_number for context in contexts]
-    if all(torch.equal(a.states, b.states) for own in of_each for a, b in zip(own, of_each[0], strict=True)):
-        return of_each[0]
-    return tuple(Batch.of_seeds(batches) for batches in zip(*of_each, strict=True))
 
 
 class AdversarialTraining:

@@ -1,6 +1,6 @@
 """The interfaces between the training loop and a method: a Learner trains, its Predictor is evaluated."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypedDict, Unpack
 
@@ -49,6 +49,14 @@ class LearnerContext:
     def steps(self) -> int:
         """The number of actions in a training trajectory."""
         return self.experts.actions.shape[1]
+
+
+def experts_of_seeds(contexts: Sequence[LearnerContext]) -> tuple[Batch, ...]:
+    """Return the training split for each number of agents: what all seeds share, or side by side what each has."""
+    of_each = [context.by_number for context in contexts]
+    if all(torch.equal(a.states, b.states) for own in of_each for a, b in zip(own, of_each[0], strict=True)):
+        return of_each[0]
+    return tuple(Batch.of_seeds(batches) for batches in zip(*of_each, strict=True))
 
 
 class Reading(TypedDict, total=False):
