@@ -87,7 +87,11 @@ def test_a_section_that_lacks_or_does_not_belong(environment: str, changes: dict
         ),
         ("mocap", "data.path=null", "environment mocap needs a data file; set data.path"),
         ("mocap", "forecast.observed=0", "forecast.observed = 0 in --set should be greater than or equal to 1."),
-        ("mocap", "forecast.noise_on=some", "forecast.noise_on = some in --set should be 'all' or 'history'."),
+        (
+            "mocap",
+            "forecast.noise_on=some",
+            "forecast.noise_on = some in --set should be 'all', 'history' or 'predictions'.",
+        ),
     ],
 )
 def test_a_bad_override_is_one_sentence(environment: str, override: str, sentence: str) -> None:

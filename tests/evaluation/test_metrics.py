@@ -23,7 +23,8 @@ def quick(predicted: np.ndarray) -> dict[str, float]:
 def test_either_lane_is_perfect(lane: int) -> None:
     values = quick(TRUTH.continuations[lane])
     assert values.pop("path_rms") == pytest.approx(0.6 / np.sqrt(3), rel=0.15)  # of offsets drawn from [-0.6, 0.6]
-    assert values == {"mode_mse": 0, "on_lane": 1, "on_path": 1, "lane_balance": 0, "lag": 0, "diverged": 0}
+    found = {"mode_mse": 0, "on_lane": 1, "between_lanes": 0, "on_path": 1, "lane_balance": 0, "lag": 0, "diverged": 0}
+    assert values == found
 
 
 def test_the_lane_of_the_expert_is_not_demanded_but_one_lane_for_the_group_is() -> None:
@@ -42,7 +43,20 @@ def test_half_and_half_is_balanced() -> None:
 def test_averaging_the_lanes_is_off_lane() -> None:
     values = quick(TRUTH.continuations.mean(axis=0))
     assert values["on_lane"] == 0
+    assert values["between_lanes"] == 1
     assert values["mode_mse"] > 0.03
+
+
+@pytest.mark.parametrize(("share", "between"), [(0.0, 0), (0.24, 0), (0.26, 1), (0.74, 1), (0.76, 0), (1.3, 0)])
+def test_between_the_lanes_is_nearer_to_the_middle_than_to_a_lane(share: float, between: float) -> None:
+    one, other = TRUTH.continuations
+    assert quick(one + share * (other - one))["between_lanes"] == between
+
+
+def test_who_is_nowhere_is_not_between_the_lanes() -> None:
+    middle = TRUTH.continuations.mean(axis=0)
+    middle[0] = np.nan
+    assert quick(middle)["between_lanes"] == pytest.approx(1 - 1 / len(middle))
 
 
 def test_constant_velocity_is_what_the_bars_are_set_against() -> None:

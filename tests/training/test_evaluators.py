@@ -82,13 +82,13 @@ def test_a_reference_has_one_answer_as_a_method_and_beside_others(toy: ToySpec, 
 
 
 class Listener(Baseline):
-    """Copies the last state and keeps the noise that it is given."""
+    """Copies the last state and keeps the noise that it is given, in order."""
 
     def __init__(self) -> None:
-        self.heard: dict[bool, Tensor | None] = {}
+        self.heard: list[Tensor | None] = []
 
     def free_run(self, observed: Tensor, *given: Any, deterministic: bool, noise: Tensor | None) -> Tensor:
-        self.heard[noise is not None] = noise
+        self.heard.append(noise)
         assert noise is None or observed.shape[0] == noise.shape[0]
         return CopyLast().free_run(observed, *given)
 
@@ -96,13 +96,15 @@ class Listener(Baseline):
         return states[:, :-1]
 
 
-def noise_of(loop: TrainingLoop) -> Tensor:
+def noises_of(loop: TrainingLoop) -> list[Tensor]:
     listener = Listener()
     loop.evaluator.final(listener, listener, listener)
-    assert listener.heard[False] is None
-    noise = listener.heard[True]
-    assert noise is not None
-    return noise
+    assert None in listener.heard  # clean
+    return [noise for noise in listener.heard if noise is not None]
+
+
+def noise_of(loop: TrainingLoop) -> Tensor:
+    return noises_of(loop)[0]
 
 
 def test_all_methods_and_seeds_meet_the_same_noise(toy: ToySpec) -> None:
@@ -118,11 +120,28 @@ def test_all_methods_and_seeds_meet_the_same_noise(toy: ToySpec) -> None:
     assert not torch.equal(first[:3], first[3:6])  # each sample has its own
 
 
-def test_noise_on_the_history_ends_with_it(toy: ToySpec) -> None:
-    everywhere, history = (noise_of(TrainingLoop(toy("bc", f"forecast.noise_on={on}"), 0)) for on in ("all", "history"))
+def test_noise_on_the_history_ends_with_it_and_noise_on_predictions_begins_there(toy: ToySpec) -> None:
+    everywhere, history, predictions = (
+        noise_of(TrainingLoop(toy("bc", f"forecast.noise_on={on}"), 0)) for on in ("all", "history", "predictions")
+    )
     assert torch.equal(history[:, :6], everywhere[:, :6])
     assert not history[:, 6:].any()
-    assert bool(everywhere[:, 6:].any())
+    assert torch.equal(history + predictions, everywhere)
+    assert bool(predictions[:, 6:].any())
+
+
+def test_every_run_has_the_errors_of_both_kinds_of_noise(toy: ToySpec) -> None:
+    *_, history, predictions = noises_of(TrainingLoop(toy("bc"), 0))
+    assert bool(history[:, :6].any())
+    assert not history[:, 6:].any()
+    assert not predictions[:, :6].any()
+    values, _ = TrainingLoop(toy("constant-velocity"), 0).final_evaluation()
+    clean, whole = values["test/mse"], values["test_noisy/mse"]
+    # constant velocity reads the last observed state for its first step, and its own prediction for each one after that
+    assert values["test_noisy_history/mse_1"] == pytest.approx(values["test_noisy/mse_1"])
+    assert values["test_noisy_predictions/mse_1"] == pytest.approx(values["test/mse_1"])
+    assert clean < values["test_noisy_predictions/mse"] < whole
+    assert clean < values["test_noisy_history/mse"] < whole
 
 
 def test_the_best_epoch_is_finite_before_it_is_small(toy: ToySpec) -> None:

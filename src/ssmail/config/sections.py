@@ -329,7 +329,7 @@ class ForecastSpec(Frozen):
     """Two agents that are nearer collide; null: not measured."""
     noise: ScaledUnits
     """Standard deviation of the Gaussian noise in the noisy test."""
-    noise_on: Literal["all", "history"]
-    """Noise on every state that the model reads, or on the observed ones only."""
+    noise_on: Literal["all", "history", "predictions"]
+    """Noise on every state that the model reads, on the observed ones only, or on its own predictions only."""
     noise_seed: NonNegativeCount
     """Seed of the noise, which all methods and seeds of runs share."""

@@ -15,6 +15,7 @@ TURNED = (
     1.5  # step lengths sideways of its start, at which an agent has turned; where it turns is in ssmail.data.yjunction
 )
 TURNING = ("turn_own", "turn_others", "turn_group", "turn_lead")
+BETWEEN = 0.25  # of the final lane separation, from the middle: as far from there as from a lane
 DIVERGED = 10.0  # |scaled position|
 BLOCK = 2**14  # distances that are computed at a time
 FORECAST_STEPS = (1, 10, 20, 40, 48)  # predicted steps whose error is a metric of its own
@@ -28,13 +29,14 @@ def lane_metrics(predicted: Floats, continuations: Floats, centre_lines: Floats,
 
     predicted (B, T, N, P) holds one rollout per start, and continuations (L, B, T, N, P) the expert from that start
     into each mode; both include the start. mode_mse and lag are in scaled units, path_rms in step lengths; on_lane,
-    on_path, lane_balance and diverged are shares.
+    between_lanes, on_path, lane_balance and diverged are shares.
     """
     rollout, modes = predicted[:, 1:], continuations[:, :, 1:]
     scaled, scaled_modes = scaling.scale_positions(rollout), scaling.scale_positions(modes)
     return {
         "mode_mse": mode_mse(scaled, scaled_modes),
         "on_lane": on_lane(rollout, modes, centre_lines),
+        "between_lanes": between_lanes(rollout, modes),
         **path_metrics(rollout, centre_lines),
         "lane_balance": lane_balance(rollout, modes),
         "lag": lag(scaled, scaled_modes),
@@ -146,6 +148,19 @@ def on_lane(predicted: Floats, continuations: Floats, centre_lines: Floats) -> f
     separation = np.linalg.norm(continuations[0, :, -1] - continuations[1, :, -1], axis=-1)
     distance = np.min([polyline_distances(final, line, extended=True) for line in centre_lines], axis=0)
     return float(np.mean(distance <= ON_LANE_TOLERANCE * separation))
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def between_lanes(predicted: Floats, continuations: Floats) -> float:
+    """Share of agents that end nearer to the middle between their two lanes than to either: what averaging leads to.
+
+    Measured along the line between the agent's final positions in the two modes. An agent whose position is not finite
+    is nowhere.
+    """
+    one, other = continuations[0, :, -1], continuations[1, :, -1]  # (B, N, 2)
+    separation, offset = other - one, predicted[:, -1] - (one + other) / 2
+    place = (offset * separation).sum(axis=-1) / np.square(separation).sum(axis=-1)  # -1/2 and 1/2 on the lanes
+    return float(np.mean(np.abs(place) < BETWEEN))
 
 
 @np.errstate(over="ignore", invalid="ignore")

@@ -57,6 +57,11 @@ CLAIM = Claim(
     section="4.6",
     figure=NAME,
 )
+NOISE_ON = {
+    "all": "every state that is read",
+    "history": "the observed history alone",
+    "predictions": "the model's own predictions alone",
+}
 NOISY, SPREAD = "test_noisy/mse", "test_noisy/mse_spread"
 READS = Reads(
     arrays=dict.fromkeys([*(f"{what}{end}/mse" for what in ("test", REFERENCE) for end in CONDITIONS.values()), SPREAD])
@@ -176,7 +181,7 @@ def collect(store: Store, selection: Selection, statistic: Statistic) -> NoiseRe
     """
     forecast = tested_alike(NAME, selection.runs)
     panels = tuple(_panel(store, selection, condition, statistic) for condition in CONDITIONS)
-    what = "every state that is read" if forecast["noise_on"] == "all" else "the observed history alone"
+    what = NOISE_ON[forecast["noise_on"]]
     noise = f"noise: std {forecast['noise']:g} (scaled units) on {what}, the same draws for all runs."
     return NoiseRecord(
         panels=panels,

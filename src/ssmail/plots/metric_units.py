@@ -16,6 +16,7 @@ UNITS = {
     "collisions": "share of agents",
     "coverage": "share of ends",
     "on_lane": "share of agents",
+    "between_lanes": "share of agents",
     "on_path": "share of agents",
     "path_rms": "step lengths",
     "turn_own": "steps per step length",

@@ -237,22 +237,25 @@ class ForecastEvaluator(Evaluator):
 
     def final(self, best: Predictor, last: Predictor, untrained: Predictor) -> tuple[dict[str, float], Arrays]:
         """Evaluate the best model, clean and noisy, sampled and by its mean; the last model; the baselines."""
-        states = self.states(self.data.test)
-        candidates = {  # predictor, deterministic, noisy
-            "test": (best, False, False),
-            "test_noisy": (best, False, True),
-            "test_mean": (best, True, False),
-            "test_mean_noisy": (best, True, True),
-            "test_last": (last, False, False),
-            "test_constant_velocity": (self.constant_velocity, True, False),
-            "test_constant_velocity_noisy": (self.constant_velocity, True, True),
-            "test_copy_last": (CopyLast(), True, False),
-            "test_copy_last_noisy": (CopyLast(), True, True),
+        states, given = self.states(self.data.test), self.forecast
+        history, predictions = (given.model_copy(update={"noise_on": on}) for on in ("history", "predictions"))
+        candidates: dict[str, tuple[Predictor, bool, ForecastSpec | None]] = {  # predictor, deterministic, its noise
+            "test": (best, False, None),
+            "test_noisy": (best, False, given),
+            "test_mean": (best, True, None),
+            "test_mean_noisy": (best, True, given),
+            "test_last": (last, False, None),
+            "test_constant_velocity": (self.constant_velocity, True, None),
+            "test_constant_velocity_noisy": (self.constant_velocity, True, given),
+            "test_copy_last": (CopyLast(), True, None),
+            "test_copy_last_noisy": (CopyLast(), True, given),
+            "test_noisy_history": (best, False, history),
+            "test_noisy_predictions": (best, False, predictions),
         }
         values: dict[str, float] = {}
         arrays: Arrays = {}
-        for prefix, (predictor, deterministic, noisy) in candidates.items():
-            predicted, truth = self._predict(predictor, states, deterministic, noisy)
+        for prefix, (predictor, deterministic, noise) in candidates.items():
+            predicted, truth = self._predict(predictor, states, deterministic, noise)
             measured, curves = forecast_metrics(predicted, truth, self.scaling)
             values |= _prefixed(prefix, measured)
             arrays |= {f"{prefix}/{name}": curve for name, curve in curves.items()}
@@ -269,12 +272,14 @@ class ForecastEvaluator(Evaluator):
         raw: np.ndarray = self.scaling.unscale_positions(scaled).astype(np.float32)
         return raw
 
-    def _predict(self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: bool) -> tuple[Floats, Floats]:
+    def _predict(
+        self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: ForecastSpec | None
+    ) -> tuple[Floats, Floats]:
         """Return predictions (S, B, T', N, D) of the frames after the observed ones, and the truth (B, T', N, D)."""
         h, steps, b = self.observed, self.predicted, len(states)
         samples = 1 if isinstance(predictor, Baseline) and not noisy else self.spec.samples
         observed = states[:, :h].repeat(samples, 1, 1, 1)
-        noise = input_noise(self.forecast, observed, steps) if noisy else None
+        noise = input_noise(noisy, observed, steps) if noisy else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
         made = to_numpy(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
         return made, to_numpy(states[:, h : h + steps])
@@ -293,7 +298,7 @@ def check_frames(forecast: ForecastSpec, data: ExpertSet) -> tuple[int, int]:
 
 
 def input_noise(forecast: ForecastSpec, observed: Tensor, steps: int) -> Tensor:
-    """Draw the noise on every state that a predictor reads: the same for all methods and seeds.
+    """Draw the noise on the states that a predictor reads: the same for all methods and seeds.
 
     observed: (B, H, N, D). The noise is (B, H + steps - 1, N, D).
     """
@@ -302,6 +307,8 @@ def input_noise(forecast: ForecastSpec, observed: Tensor, steps: int) -> Tensor:
     noise = forecast.noise * torch.randn(b, h + steps - 1, n, d, generator=generator)
     if forecast.noise_on == "history":
         noise[:, h:] = 0
+    if forecast.noise_on == "predictions":
+        noise[:, :h] = 0
     return noise.to(observed.device)
 
 
