@@ -1,6 +1,4 @@
-"""EdgeLayers in chunks against the same layers written as one operation after the other, and both LSTMs in one
-function against two of torch's.
-"""
+"""EdgeLayers in chunks against the same layers written as one operation after the other."""
 
 import pytest
 import torch
@@ -14,7 +12,6 @@ from ssmail.models.fast_messages import (
     Activation,
     EdgeLayers,
     between_different,
-    both_ways,
     by_steps,
     chunks,
     nonzero_rows,
@@ -95,40 +92,6 @@ def test_the_faster_activations(dtype: torch.dtype) -> None:
             rtol=1e-6,
             atol=2e-7 if dtype == torch.float32 else 1e-15,
         )
-
-
-def lstm_results(past: nn.LSTM, future: nn.LSTM, x: Tensor, scale: Tensor, shift: Tensor, ours: bool) -> list[Tensor]:
-    """The hidden states, and the gradients of a function of them."""
-    leaves = [x, scale, shift, *past.parameters(), *future.parameters()]
-    if ours:
-        both = both_ways(x, past, future, scale, shift)
-    else:
-        read = scale * x + shift
-        both = torch.cat([past(read)[0], future(read.flip(0))[0].flip(0)], dim=-1)
-    first, factors = both[..., : past.hidden_size], torch.linspace(1, 2, both.numel()).view(both.shape)
-    mixed = first.cos().sum() + (both * factors).sin().sum()
-    return [both, *torch.autograd.grad(mixed, leaves)]
-
-
-@pytest.mark.parametrize("by_torch", [True, False])
-@pytest.mark.parametrize("steps", [1, 2, 7])
-def test_lstms_both_ways(by_torch: bool, steps: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fast_messages, "ONE_BY_ONE_UP_TO", 10**9 if by_torch else 0)
-    torch.manual_seed(0)
-    past, future = nn.LSTM(4, 3).double(), nn.LSTM(4, 3).double()
-    x, scale, shift = (
-        torch.randn(shape, dtype=torch.float64).requires_grad_() for shape in ((steps, 6, 4), (4,), (4,))
-    )
-    ours, theirs = (lstm_results(past, future, x, scale, shift, ours) for ours in (True, False))
-    for mine, other in zip(ours, theirs, strict=True):
-        torch.testing.assert_close(mine, other, rtol=1e-9, atol=1e-12)
-    exchanged = lstm_results(future, past, x, scale, shift, ours=True)  # negative control
-    assert not torch.allclose(exchanged[0], theirs[0])
-
-
-def test_without_edges_there_is_nothing_to_remember() -> None:
-    past, future = nn.LSTM(4, 3), nn.LSTM(4, 3)
-    assert both_ways(torch.zeros(5, 0, 4), past, future, torch.ones(4), torch.zeros(4)).shape == (5, 0, 6)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from ssmail.models import decoders, fast_messages, message_passing, variational_encoder
+from ssmail.models import decoders, fast_lstm, fast_messages, message_passing, variational_encoder
 from ssmail.models.critic import TwinCritic
 from ssmail.models.decoders import MessageDecoder, RecurrentDecoder
 from ssmail.models.discriminator import Discriminator
@@ -69,7 +69,7 @@ def test_encoders(n: int, batch_norm: bool, training: bool) -> None:
 
 def test_encoders_in_chunks_and_with_both_lstms_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     """As larger systems are computed."""
-    monkeypatch.setattr(fast_messages, "ONE_BY_ONE_UP_TO", 0)
+    monkeypatch.setattr(fast_lstm, "ONE_BY_ONE_UP_TO", 0)
     monkeypatch.setattr(fast_messages, "CHUNK", 2 * 4 * 3 * 8)
     torch.manual_seed(0)
     x = torch.randn(3, 5, 4, 5)

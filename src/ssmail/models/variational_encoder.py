@@ -18,7 +18,8 @@ from torch import Tensor, nn
 
 from ssmail.config.sections import VariationalSpec
 from ssmail.models import message_passing
-from ssmail.models.fast_messages import ELU, EdgeLayers, both_ways, by_steps
+from ssmail.models.fast_lstm import both_ways
+from ssmail.models.fast_messages import ELU, EdgeLayers, by_steps
 from ssmail.models.graph_encoder import EdgeLSTM, Memory, on_diagonal
 
 
