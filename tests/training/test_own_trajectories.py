@@ -119,7 +119,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one(make: Make, method: str) -> N
 
 
 def test_seeds_trained_together_equal_seeds_trained_alone(make: Make) -> None:
-    spec = make("ssail", "training.batch=16")
+    # batches that fill the processor's vectors (tests/training/test_together.py): 16 rollouts of 2, 3 and 4 agents
+    spec = make("ssail", "training.batch=16", "adversarial.rollouts=48", "training.epochs=4")
     loops = [TrainingLoop(spec, seed) for seed in (0, 1)]
     alone = [together([TrainingLoop(spec, seed)])[0] for seed in (0, 1)]
     assert together(loops) == alone
