@@ -53,7 +53,7 @@ def test_between_the_lanes_is_nearer_to_the_middle_than_to_a_lane(share: float, 
     assert quick(one + share * (other - one))["between_lanes"] == between
 
 
-def test_who_is_nowhere_is_not_between_the_lanes() -> None:
+def test_a_diverged_agent_is_not_between_the_lanes() -> None:
     middle = TRUTH.continuations.mean(axis=0)
     middle[0] = np.nan
     assert quick(middle)["between_lanes"] == pytest.approx(1 - 1 / len(middle))

@@ -150,15 +150,15 @@ def on_lane(predicted: Floats, continuations: Floats, centre_lines: Floats) -> f
     return float(np.mean(distance <= ON_LANE_TOLERANCE * separation))
 
 
-@np.errstate(over="ignore", invalid="ignore")
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def between_lanes(predicted: Floats, continuations: Floats) -> float:
     """Share of agents that end nearer to the middle between their two lanes than to either: what averaging leads to.
 
-    Measured along the line between the agent's final positions in the two modes. An agent whose position is not finite
-    is nowhere.
+    Measured along the line between the agent's final positions in the two modes. predicted is (B, T, N, 2), or
+    (S, B, T, N, 2). An agent whose position is not finite does not count as between the lanes.
     """
-    one, other = continuations[0, :, -1], continuations[1, :, -1]  # (B, N, 2)
-    separation, offset = other - one, predicted[:, -1] - (one + other) / 2
+    one, other = continuations[:2, :, -1]  # (B, N, 2) each
+    separation, offset = other - one, predicted[..., -1, :, :] - (one + other) / 2
     place = (offset * separation).sum(axis=-1) / np.square(separation).sum(axis=-1)  # -1/2 and 1/2 on the lanes
     return float(np.mean(np.abs(place) < BETWEEN))
 

@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from ssmail.data.trajectories import Booleans, Floats, Integers
-from ssmail.evaluation.metrics import ON_PATH_TOLERANCE, nearest_mode, path_distances, stays_on_path
+from ssmail.evaluation.metrics import ON_PATH_TOLERANCE, between_lanes, nearest_mode, path_distances, stays_on_path
 from ssmail.paper.claims import Claim, Part, Sample
 from ssmail.paper.hypotheses import beside, smaller
 from ssmail.paper.samples import LEAST, WORST, Array, Other, Runs
@@ -226,16 +226,8 @@ def _panel_rows(panel: Panel) -> pd.DataFrame:
 
 
 def share_between(rollouts: Floats, lanes: Floats) -> float:
-    """Compute BETWEEN_STATISTIC from stored rollouts (S, B, T, N, 2) and lanes (2, B, T, N, 2).
-
-    An end that is not finite is not between the lanes.
-    """
-    ends = shown_rollouts(rollouts)[:, :, -1]
-    left, right = shown_lanes(lanes)[:, :, -1].astype(np.float64)  # (B, N, 2) each
-    across = right - left
-    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        place = ((ends - left) * across).sum(axis=-1) / np.square(across).sum(axis=-1)  # 0: left, 1: right
-        return float(np.mean(np.abs(place - 0.5) < 0.25))
+    """Compute BETWEEN_STATISTIC from stored rollouts (S, B, T, N, 2) and lanes (2, B, T, N, 2)."""
+    return between_lanes(shown_rollouts(rollouts), shown_lanes(lanes).astype(np.float64))
 
 
 def samples(runs: Runs) -> tuple[tuple[Sample, ...], ...]:

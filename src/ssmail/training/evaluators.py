@@ -254,8 +254,8 @@ class ForecastEvaluator(Evaluator):
         }
         values: dict[str, float] = {}
         arrays: Arrays = {}
-        for prefix, (predictor, deterministic, noise) in candidates.items():
-            predicted, truth = self._predict(predictor, states, deterministic, noise)
+        for prefix, (predictor, deterministic, noise_of) in candidates.items():
+            predicted, truth = self._predict(predictor, states, deterministic, noise_of)
             measured, curves = forecast_metrics(predicted, truth, self.scaling)
             values |= _prefixed(prefix, measured)
             arrays |= {f"{prefix}/{name}": curve for name, curve in curves.items()}
@@ -273,13 +273,13 @@ class ForecastEvaluator(Evaluator):
         return raw
 
     def _predict(
-        self, predictor: Predictor, states: Tensor, deterministic: bool, noisy: ForecastSpec | None
+        self, predictor: Predictor, states: Tensor, deterministic: bool, noise_of: ForecastSpec | None
     ) -> tuple[Floats, Floats]:
         """Return predictions (S, B, T', N, D) of the frames after the observed ones, and the truth (B, T', N, D)."""
         h, steps, b = self.observed, self.predicted, len(states)
-        samples = 1 if isinstance(predictor, Baseline) and not noisy else self.spec.samples
+        samples = 1 if isinstance(predictor, Baseline) and not noise_of else self.spec.samples
         observed = states[:, :h].repeat(samples, 1, 1, 1)
-        noise = input_noise(noisy, observed, steps) if noisy else None
+        noise = input_noise(noise_of, observed, steps) if noise_of else None
         predicted = predictor.free_run(observed, steps, self.generator, deterministic=deterministic, noise=noise)
         made = to_numpy(predicted[:, 1:]).reshape(samples, b, steps, *states.shape[2:])
         return made, to_numpy(states[:, h : h + steps])
