@@ -45,4 +45,6 @@ def test_the_commands_run_from_the_table_to_the_figures(folder: Path, capsys: py
     figures = {path.name.split(".")[0] for path in (folder / "results" / "figures").iterdir()}
     assert any(name.startswith("forecast") for name in figures)
     assert any(name.startswith("trajectories") for name in figures)
-    assert (folder / "futures.csv").read_text().count("\n") > 20
+    futures = (folder / "futures.csv").read_text().splitlines()
+    assert futures[0] == "window,scene,sample,step,frame,agent,x,y"
+    assert len(futures) > 20

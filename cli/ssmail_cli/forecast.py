@@ -7,6 +7,7 @@ import typer
 
 from ssmail_cli import options
 from ssmail_cli.artifacts import ArtifactsGiven
+from ssmail_cli.import_data import AgentColumn, FrameColumn, SceneColumn, XColumn, YColumn, ZColumn, seconds
 from ssmail_cli.output import note, say, write_json
 
 if TYPE_CHECKING:
@@ -26,7 +27,9 @@ def forecast(
     data: Annotated[
         Path,
         typer.Argument(
-            metavar="DATA", help="An expert set (.npz: its test split), or an array (M, T, N, P) in .npy or .npz."
+            metavar="DATA",
+            help="A table as for import-data (the last frames of each scene), an expert set (its test split), or an "
+            "array (M, T, N, P) in .npy or .npz.",
         ),
     ],
     out: Annotated[Path, typer.Option("--out", help="The .csv, .parquet or .npz file to write.")] = Path("futures.csv"),
@@ -45,6 +48,16 @@ def forecast(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, max=2**63 - 1, help="Of the samples.")] = 0,
+    scene: SceneColumn = None,
+    frame: FrameColumn = None,
+    agent: AgentColumn = None,
+    x: XColumn = None,
+    y: YColumn = None,
+    z: ZColumn = None,
+    dt: Annotated[
+        float | None,
+        typer.Option("--dt", help="Seconds of a step; with it, --frame may be a column of times.", show_default=False),
+    ] = None,
     model: ModelOption = "best",
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,
@@ -55,15 +68,19 @@ def forecast(
     """Sample the futures of observed agents with the trained model of a run.
 
     Writes a row for each window, sample, step and agent, with its position x, y and z in the units of the data; .npz
-    has the positions (samples, windows, steps, agents, axes) instead. The same seed yields the same numbers.
+    has the positions (samples, windows, steps, agents, axes) instead. A table is forecast beyond the end of each of its
+    scenes, for the agents that are present in the last frames, and the rows have its scenes, frames and agents. The
+    same seed yields the same numbers.
     """
+    from ssmail.data.importing.tables import Columns
     from ssmail.inference import forecast as forecasts
     from ssmail.inference.trained_run import load_from
-    from ssmail.inference.windows import read_windows
+    from ssmail.inference.windows import TableOptions, read_windows
 
     forecasts.check_output(out, force=force)
     trained = load_from(options.open_store(db, artifacts=artifacts), run, model=cast("Model", model), data=expert_set)
-    windows = read_windows(data, trained, observed)
+    table = TableOptions(Columns(scene, frame, agent, x, y, z), seconds(dt))
+    windows = read_windows(data, trained, observed, table, note)
     found = forecasts.forecast(trained, windows, steps, samples, seed)
     rows = forecasts.write(found, out, force=force)
     _, w, t, *_ = found.positions.shape
@@ -82,7 +99,13 @@ def export_model(
     out: Annotated[Path, typer.Option("--out", help="The folder to write.")],
     agents: Annotated[
         int | None,
-        typer.Option("--agents", min=1, max=1000, help="Agents of a group.", show_default="as in the expert set"),
+        typer.Option(
+            "--agents",
+            min=1,
+            max=1000,
+            help="Agents of a group; of your own data, it has to be given unless the model tells its agents apart.",
+            show_default="as in the data",
+        ),
     ] = None,
     batch: Annotated[int, typer.Option("--batch", min=1, max=1000, help="Groups that a program steps at once.")] = 1,
     onnx: Annotated[bool, typer.Option("--onnx/--no-onnx", help="Write the programs as ONNX too.")] = True,

@@ -18,6 +18,25 @@ if TYPE_CHECKING:
 PRESENT = "{0}, if there is such a column"
 BY_FILE = "scene, else each file is a scene"
 
+SceneColumn = Annotated[
+    str | None, typer.Option("--scene", help="Column with the name of the scene.", show_default=BY_FILE)
+]
+FrameColumn = Annotated[
+    str | None, typer.Option("--frame", help="Column with the number of the frame.", show_default="frame")
+]
+AgentColumn = Annotated[
+    str | None, typer.Option("--agent", help="Column with the name of the agent.", show_default="agent")
+]
+XColumn = Annotated[str | None, typer.Option("--x", help="Column with the first coordinate.", show_default="x")]
+YColumn = Annotated[
+    str | None,
+    typer.Option("--y", help="Column with the second coordinate; '' for none.", show_default=PRESENT.format("y")),
+]
+ZColumn = Annotated[
+    str | None,
+    typer.Option("--z", help="Column with the third coordinate; '' for none.", show_default=PRESENT.format("z")),
+]
+
 
 def import_data(
     sources: Annotated[
@@ -25,24 +44,12 @@ def import_data(
         typer.Argument(metavar="SOURCE...", help="CSV, Parquet, .npy or .npz files, or folders that contain some."),
     ],
     out: Annotated[Path, typer.Option("--out", help="The .npz file to write.")] = Path("data/trajectories.npz"),
-    scene: Annotated[
-        str | None, typer.Option("--scene", help="Column with the name of the scene.", show_default=BY_FILE)
-    ] = None,
-    frame: Annotated[
-        str | None, typer.Option("--frame", help="Column with the number of the frame.", show_default="frame")
-    ] = None,
-    agent: Annotated[
-        str | None, typer.Option("--agent", help="Column with the name of the agent.", show_default="agent")
-    ] = None,
-    x: Annotated[str | None, typer.Option("--x", help="Column with the first coordinate.", show_default="x")] = None,
-    y: Annotated[
-        str | None,
-        typer.Option("--y", help="Column with the second coordinate; '' for none.", show_default=PRESENT.format("y")),
-    ] = None,
-    z: Annotated[
-        str | None,
-        typer.Option("--z", help="Column with the third coordinate; '' for none.", show_default=PRESENT.format("z")),
-    ] = None,
+    scene: SceneColumn = None,
+    frame: FrameColumn = None,
+    agent: AgentColumn = None,
+    x: XColumn = None,
+    y: YColumn = None,
+    z: ZColumn = None,
     dt: Annotated[
         float | None,
         typer.Option(
@@ -95,7 +102,7 @@ def import_data(
 
     options = ImportOptions(
         columns=Columns(scene, frame, agent, x, y, z),
-        dt=_seconds(dt),
+        dt=seconds(dt),
         window=window,
         observed=observed,
         stride=stride,
@@ -112,7 +119,8 @@ def import_data(
     _print_summary(experts, summary, out, as_json)
 
 
-def _seconds(dt: float | None) -> float | None:
+def seconds(dt: float | None) -> float | None:
+    """Return the value of --dt. Raises InputError for one that is not positive, or out of range."""
     if dt is not None and not 1e-9 <= dt <= 1e9:
         raise InputError(f"--dt takes the seconds of a step, not {dt:g}; give a positive number")
     return dt

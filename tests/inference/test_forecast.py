@@ -2,12 +2,15 @@
 
 import json
 import os
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from ssmail.data.expert_sets import save
+from ssmail.data.importing.dataset import ImportOptions, import_set
 from ssmail.inference.forecast import Forecast, forecast
 from ssmail.inference.trained_run import load_run
 from ssmail.inference.windows import Windows, read_windows
@@ -153,3 +156,90 @@ def test_what_cannot_be_forecast_is_one_sentence(
         assert command([*arguments, *more]) == 2
         assert said in capsys.readouterr().err
     assert not out.exists()
+
+
+def write_walks(path: Path, seconds: float | None = None) -> Path:
+    """The walks of WALK as two scenes that begin with another frame; in a third one nobody stays to the end."""
+    names = ("frame", "agent", "scene") if seconds is None else ("t", "who", "place")
+    lines = [f"{','.join(names)},x,y"]
+    for scene, frames in enumerate(WALK):
+        for frame, agents in enumerate([agents - 0.7 for agents in frames[:1]] + list(frames)):
+            for name, (x, y) in zip(("zoe", "abe", "mia"), agents.tolist(), strict=True):
+                number = 5 * frame if seconds is None else round(seconds * frame, 6)
+                lines.append(f"{number},{name},day{scene},{x},{y}")
+    lines += [f"{frame},{name},empty,0,0" for name, frame in (("abe", 0), ("abe", 5), ("mia", 10), ("mia", 15))]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_table_is_forecast_beyond_the_end_of_its_scenes(
+    train: Train, arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the names, scenes and frames of the table. Agents come in the order of their names, as in an expert set."""
+    write_walks(tmp_path / "walk.csv")
+    command_line = [*arguments[:2], str(tmp_path / "walk.csv"), *arguments[3:], "--observed", "3", "--samples", "2"]
+    assert command([*command_line, "--out", str(tmp_path / "futures.csv")]) == 0
+    assert "1 of 3 scenes have no agent in all of their last 4 frames" in capsys.readouterr().err
+    table = pd.read_csv(tmp_path / "futures.csv")
+    assert list(table.columns) == ["window", "scene", "sample", "step", "frame", "agent", "x", "y"]
+    expected = load_run(train("ssail").id, train("ssail").db).rollout(WALK[:, :, [1, 2, 0]], 4, samples=2, seed=0)
+    values = table[["x", "y"]].to_numpy().reshape(2, 2, 4, 3, 2)
+    np.testing.assert_allclose(values.swapaxes(0, 1), expected)
+    assert table["scene"].tolist() == ["day0"] * 24 + ["day1"] * 24
+    assert table["agent"].tolist() == ["abe", "mia", "zoe"] * 16
+    assert table["frame"].tolist() == [25] * 3 + [30] * 3 + [35] * 3 + [40] * 3 + table["frame"].tolist()[12:]
+    assert (table["frame"] == 20 + 5 * table["step"]).all()
+
+    assert command([*command_line, "--out", str(tmp_path / "futures.npz")]) == 0
+    with np.load(tmp_path / "futures.npz") as file:
+        np.testing.assert_allclose(file["positions"], expected)
+        assert file["scene"].tolist() == ["day0", "day1"]
+        assert file["frame"].tolist() == [[25, 30, 35, 40]] * 2
+        assert file["agent"].tolist() == [["abe", "mia", "zoe"]] * 2
+
+
+def test_a_table_may_have_other_columns_and_times(
+    train: Train, arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_walks(tmp_path / "walk.csv", seconds=0.1)
+    given = [*arguments[:2], str(tmp_path / "walk.csv"), *arguments[3:], "--observed", "2"]
+    out = ["--out", str(tmp_path / "futures.csv")]
+    assert command([*given, *out]) == 2
+    assert "has no column 'frame'" in capsys.readouterr().err
+    columns = ["--frame", "t", "--agent", "who", "--scene", "place", "--dt", "0.1"]
+    (tmp_path / "walk.csv").write_text("\n".join((tmp_path / "walk.csv").read_text().splitlines()[:31]))
+    assert command([*given, *columns, *out]) == 0
+    table = pd.read_csv(tmp_path / "futures.csv")
+    assert sorted(set(table["frame"])) == [0.5, 0.6, 0.7, 0.8]
+    expected = load_run(train("ssail").id, train("ssail").db).rollout(WALK[:, 1:, [1, 2, 0]], 4, samples=20, seed=0)
+    np.testing.assert_allclose(table[["x", "y"]].to_numpy().reshape(2, 20, 4, 3, 2).swapaxes(0, 1), expected)
+    for more, said in (
+        (["--observed", "9"], "no scene of"),
+        (["--dt", "-1"], "--dt takes the seconds of a step"),
+    ):
+        assert command([*given, *columns, *more, *out, "--force"]) == 2
+        assert said in capsys.readouterr().err
+
+
+def test_windows_of_an_expert_set_have_their_scenes(train: Train, tmp_path: Path) -> None:
+    """As the set has no names of agents, they have numbers."""
+    grid = product(range(3), range(9), "ab")
+    walks = pd.DataFrame(
+        [(f"day{scene}", 5 + frame, agent, (1.0 + scene) * frame**2) for scene, frame, agent in grid],
+        columns=["scene", "frame", "agent", "x"],
+    )
+    walks.to_csv(tmp_path / "walks.csv", index=False)
+    experts, _ = import_set([tmp_path / "walks.csv"], ImportOptions(window=4, stride=4))
+    save(experts, tmp_path / "walks.npz")
+    trained = train("constant-velocity", "trajectories", f"data.path={tmp_path / 'walks.npz'}")
+    run = load_run(trained.id, trained.db)
+    found = forecast(run, read_windows(tmp_path / "walks.npz", run), None, 1, 0)
+    table = pd.concat(found.pieces())
+    assert list(table.columns) == ["window", "scene", "start", "sample", "step", "agent", "x"]
+    (scene,) = set(table["scene"])
+    assert scene in {"day0", "day1", "day2"}
+    assert table["start"].tolist() == [6] * 4 + [10] * 4
+    assert table["agent"].tolist() == [0, 1] * 4
+    last, before = table["start"] - 4, table["start"] - 5
+    expected = (1 + int(scene[-1])) * (last**2 + table["step"] * (last**2 - before**2))
+    np.testing.assert_allclose(table["x"], expected)

@@ -12,7 +12,7 @@ from ssmail.data.expert_sets import check_target
 from ssmail.data.trajectories import Floats, Integers
 from ssmail.errors import InputError, missing_package, unknown_name
 from ssmail.inference.trained_run import TrainedRun
-from ssmail.inference.windows import Windows
+from ssmail.inference.windows import Origin, Windows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,25 +28,48 @@ class Forecast:
     """Sampled futures of W windows.
 
     positions: (S, W, T', N, P), raw units, NaN for agents that a window does not have. agents: (W,) how many it has.
+    origin: the scenes, frames and agents in the file, as far as it has them.
     """
 
     positions: Floats
     agents: Integers
+    origin: Origin | None = None
+
+    @property
+    def frames(self) -> Floats | None:
+        """The numbers (W, T') of the predicted frames, or their times; None unless the windows are of a table."""
+        if self.origin is None or self.origin.frame is None or self.origin.step is None:
+            return None
+        steps = np.arange(1, self.positions.shape[2] + 1)
+        frames: Floats = np.round(self.origin.frame[:, None] + steps * self.origin.step[:, None], 9)
+        return frames.astype(np.int64) if (frames % 1 == 0).all() else frames
 
     def pieces(self) -> "Iterator[pd.DataFrame]":
         """Yield the table in pieces of some windows: window, sample, step, agent, and x, y, z as far as there are axes.
 
-        Windows, samples and agents count from 0, and steps from 1, the first one after the observed frames.
+        Windows, samples and agents count from 0, and steps from 1, the first one after the observed frames. Windows of
+        an expert set also have their scene and its first observed frame, `start`; those of a table the scene, the
+        predicted frame, and the agent's name instead of its number.
         """
         import pandas as pd
 
         samples, windows, steps, agents, axes = self.positions.shape
         together = max(ROWS // (samples * steps * agents), 1)
+        origin, frames = self.origin, self.frames
         for first in range(0, windows, together):
             part = self.positions[:, first : first + together].swapaxes(0, 1)  # (W, S, T', N, P)
             w, s, t, n = (index.ravel() for index in np.indices(part.shape[:-1]))
-            present = n < self.agents[first + w]
-            columns: dict[str, Any] = {"window": first + w, "sample": s, "step": t + 1, "agent": n}
+            w = w + first
+            present = n < self.agents[w]
+            columns: dict[str, Any] = {"window": w}
+            if origin is not None:
+                columns["scene"] = origin.scene[w]
+            if origin is not None and origin.start is not None:
+                columns["start"] = origin.start[w]
+            columns |= {"sample": s, "step": t + 1}
+            if frames is not None:
+                columns["frame"] = frames[w, t]
+            columns["agent"] = n if origin is None or origin.agent is None else origin.agent[w, n]
             columns |= dict(zip(AXES, part.reshape(-1, axes).T, strict=False))
             yield pd.DataFrame({name: values[present] for name, values in columns.items()})
 
@@ -72,7 +95,7 @@ def forecast(run: TrainedRun, windows: Windows, steps: int | None, samples: int,
     for number in np.unique(windows.agents):
         chosen = np.flatnonzero(windows.agents == number)
         futures[:, chosen, :, :number] = run.rollout(windows.positions[chosen, :, :number], count, samples, seed)
-    return Forecast(futures, windows.agents)
+    return Forecast(futures, windows.agents, windows.origin)
 
 
 def check_output(path: Path, *, force: bool) -> None:
@@ -90,8 +113,8 @@ def check_output(path: Path, *, force: bool) -> None:
 def write(found: Forecast, path: Path, *, force: bool = False) -> int:
     """Write a forecast to a .csv, .parquet or .npz file, whole or not at all; return the number of its rows.
 
-    An .npz file holds the arrays `positions` and `agents`. Raises InputError as `check_output` does, and if the file
-    cannot be written.
+    An .npz file holds the arrays `positions` and `agents`, and `scene`, `start`, `frame` and `agent` as far as the data
+    have them. Raises InputError as `check_output` does, and if the file cannot be written.
     """
     check_output(path, force=force)
     writers = {".csv": _write_csv, ".parquet": _write_parquet, ".npz": _write_arrays}
@@ -131,4 +154,12 @@ def _write_parquet(found: Forecast, path: Path) -> None:
 
 def _write_arrays(found: Forecast, path: Path) -> None:
     with path.open("wb") as file:
-        np.savez(file, positions=found.positions, agents=found.agents)
+        np.savez(file, positions=found.positions, agents=found.agents, **_origin_arrays(found))
+
+
+def _origin_arrays(found: Forecast) -> dict[str, Any]:
+    """Return which scenes, frames (W, T') and agents (W, N) the positions are of, as far as the data have them."""
+    if found.origin is None:
+        return {}
+    arrays = {"scene": found.origin.scene, "start": found.origin.start, "frame": found.frames}
+    return {name: array for name, array in (arrays | {"agent": found.origin.agent}).items() if array is not None}

@@ -1,22 +1,47 @@
-"""The windows to forecast: the test split of an expert set, or an array of positions from anyone."""
+"""The windows to forecast: the test split of an expert set, the end of each scene of a table, or an array."""
 
 import os
 import zipfile
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ssmail.config.foreign_files import ARCHIVE_ERRORS, open_regular
 from ssmail.data.expert_sets import load
+from ssmail.data.importing.cutting import LARGEST_SET, MOST_AGENTS, cut
+from ssmail.data.importing.rows import quoted
+from ssmail.data.importing.sources import TABLES, find_files, read_files
+from ssmail.data.importing.tables import Columns
+from ssmail.data.importing.tracks import LARGEST_FRAME, make_tracks
 from ssmail.data.npz_file import LARGEST_FILE, Header, NpzFile
 from ssmail.data.trajectories import ExpertSet, Floats, Integers
 from ssmail.errors import InputError
 from ssmail.inference.trained_run import TrainedRun
 
-REMEDY = "give an expert set, or an array (M, T, N, P) saved with numpy.save or numpy.savez(file, positions=array)"
+REMEDY = (
+    "give a table (.csv or .parquet), an expert set, or an array (M, T, N, P) saved with numpy.save or "
+    "numpy.savez(file, positions=array)"
+)
 _SET_ARRAYS = {"parameters.npy", "hash.npy"}
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where windows come from, as far as the file says.
+
+    scene: (W,) its name. start: (W,) the number of the first observed frame, in an expert set. frame, step: (W,) of a
+    table, the last observed frame, and how far it is to the next one. agent: (W, N) the names in a table.
+    """
+
+    scene: NDArray[np.str_]
+    start: Integers | None = None
+    frame: Floats | None = None
+    step: Floats | None = None
+    agent: NDArray[np.str_] | None = None
 
 
 @dataclass(frozen=True)
@@ -24,22 +49,41 @@ class Windows:
     """Observed positions (W, T, N, P), one frame more than states, and the numbers (W,) of agents.
 
     Rows from a window's number of agents on are padding. steps: how many steps the expert set is made to predict; None
-    for an array.
+    for an array. origin: None for an array.
     """
 
     positions: Floats
     agents: Integers
     steps: int | None = None
+    origin: Origin | None = None
 
 
-def read_windows(path: Path, run: TrainedRun, observed: int | None = None) -> Windows:
-    """Read what to forecast from an expert set, of which it is the test split, or from an array (M, T, N, P).
+@dataclass(frozen=True)
+class TableOptions:
+    """How to read a table: the names of its columns; and the seconds of a frame, if the frames are times."""
+
+    columns: Columns = field(default_factory=Columns)
+    dt: float | None = None
+
+
+def read_windows(
+    path: Path,
+    run: TrainedRun,
+    observed: int | None = None,
+    table: TableOptions | None = None,
+    report: Callable[[str], None] = lambda _: None,
+) -> Windows:
+    """Read what to forecast: the test split of an expert set, the end of each scene of a table, or an array.
 
     observed: how many frames of each window are observed. By default as many as in the test of the run, and of an array
-    all of them. An expert set also holds the velocities of its first frames, so these count as states.
+    (M, T, N, P) all of them. The first velocity needs one frame before, which an expert set has and a table needs. Of a
+    table, or a folder of tables, a window is the last frames of a scene, with the agents that are in all of them.
+    report: is told of scenes without such agents.
 
-    Raises InputError if the file is none of the two, if it belongs to another environment, or if it has fewer frames.
+    Raises InputError if the file is none of these, if it belongs to another environment, or if it has fewer frames.
     """
+    if path.is_dir() or path.suffix.lower() in TABLES:
+        return _of_tables(path, run, observed, table or TableOptions(), report)
     try:
         with open_regular(path) as file:
             packed, size = zipfile.is_zipfile(file), os.fstat(file.fileno()).st_size
@@ -68,7 +112,43 @@ def _of_set(experts: ExpertSet, run: TrainedRun, observed: int | None) -> Window
     positions = np.concatenate([before, test.positions[:, :count]], axis=1)
     every = np.full(len(test), positions.shape[2], dtype=np.int64)
     steps = run.predicted or parameters.get("predicted")
-    return Windows(positions, every if test.agents is None else test.agents, steps if isinstance(steps, int) else None)
+    origin = None
+    if test.scene is not None and experts.scenes:
+        origin = Origin(np.array(experts.scenes)[test.scene], start=test.frame)
+    agents = every if test.agents is None else test.agents
+    return Windows(positions, agents, steps if isinstance(steps, int) else None, origin)
+
+
+def _of_tables(
+    path: Path, run: TrainedRun, observed: int | None, table: TableOptions, report: Callable[[str], None]
+) -> Windows:
+    count = observed or run.observed
+    if count is None:
+        raise InputError("nothing tells how many frames of a scene are observed; give --observed.")
+    frames = count + 1
+    rows, _ = read_files(find_files([path]), table.columns, report)
+    tracks, _ = make_tracks(rows, table.dt, fill_gaps=0)
+    end = np.zeros(len(rows.scenes), dtype=np.int64)
+    np.maximum.at(end, tracks.scene, tracks.begin + tracks.length)
+    found = cut(tracks, end - frames, frames, stride=2 * LARGEST_FRAME)
+    label = quoted(path, 80)
+    if not len(found):
+        raise InputError(
+            f"no scene of {label} has an agent in each of its last {frames} frames, {count} to observe and one before "
+            "for the velocity; lower --observed, or leave out the end of the scenes"
+        )
+    if missing := len(rows.scenes) - len(found):
+        report(f"{missing:,} of {len(rows.scenes):,} scenes have no agent in all of their last {frames} frames")
+    most = int(found.agents.max())
+    if most > MOST_AGENTS or len(found) * frames * most * 24 > LARGEST_SET:
+        raise InputError(f"{len(found):,} scenes of up to {most:,} agents are too many at once; give them in parts")
+    agents = np.full((len(found), most), "", dtype=f"U{max(map(len, rows.agents))}")
+    agents[found.window, found.slot] = np.array(rows.agents)[found.names]
+    unit = table.dt if table.dt and (rows.frame % 1 != 0).any() else 1.0
+    step = tracks.step[found.scene].astype(np.float64) * unit
+    last = tracks.first[found.scene] * unit + (end[found.scene] - 1) * step
+    origin = Origin(np.array(rows.scenes)[found.scene], frame=last, step=step, agent=agents)
+    return Windows(found.positions(most), found.agents, origin=origin)
 
 
 def _of_array(positions: Floats, path: Path, observed: int | None) -> Windows:
