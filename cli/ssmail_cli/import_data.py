@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from ssmail.data.trajectories import ExpertSet
 
 PRESENT = "{0}, if there is such a column"
+SAME = "the same ones in all scenes, by their names; if they are not, import with --no-same-agents"
+DIFFERENT = "not the same ones in all scenes"
 BY_FILE = "scene, else each file is a scene"
 
 SceneColumn = Annotated[
@@ -87,6 +89,14 @@ def import_data(
     test: Annotated[
         list[str] | None, typer.Option("--test", help="With --validation: scenes to test on; the rest is trained on.")
     ] = None,
+    same_agents: Annotated[
+        bool | None,
+        typer.Option(
+            "--same-agents/--no-same-agents",
+            help="Whether row n of all windows is the same agent, so that models may tell agents apart.",
+            show_default="by the agents' names",
+        ),
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -112,9 +122,12 @@ def import_data(
         split=_shares(split),
         validation=tuple(validation or ()),
         test=tuple(test or ()),
+        same_agents=same_agents,
     )
+    if out.suffix.lower() != ".npz":
+        raise InputError(f"--out {out} does not end in .npz, as the name of an expert set does; choose another")
     expert_sets.check_target(out, force=force)
-    experts, summary = import_set(sources, options, note)
+    experts, summary = import_set(sources, options, note, out)
     expert_sets.save(experts, out, force=force)
     _print_summary(experts, summary, out, as_json)
 
@@ -145,6 +158,7 @@ def _print_summary(experts: "ExpertSet", summary: "Summary", out: Path, as_json:
                 "rows": summary.rows,
                 "scenes": summary.scenes,
                 "splits": summary.splits,
+                "same_agents": summary.same_agents,
                 "speeds": summary.speeds,
                 "left_out": summary.left_out,
                 "remarks": summary.remarks,
@@ -170,6 +184,7 @@ def _print_summary(experts: "ExpertSet", summary: "Summary", out: Path, as_json:
         files = "1 file" if summary.files == 1 else f"{summary.files:,} files"
         say(f"read {summary.rows:,} rows of {summary.scenes:,} scenes from {files}")
         say(f"speeds in units per {unit}: {speeds}")
+        say(f"agents: {SAME if summary.same_agents else DIFFERENT}")
         for what, count in summary.left_out.items():
             if count:
                 say(f"{what}: {count:,}")

@@ -24,7 +24,7 @@ def test_a_set_is_written_and_told_of(cli: CommandLine, table: Path, tmp_path: P
     outcome = cli("import-data", table, "--out", out, "--window", 30, "--dt", 0.2)
     experts = expert_sets.load(out, "trajectories")
     assert outcome.code == 0
-    heading, *splits, read, speeds, unused, wrote = outcome.out.splitlines()
+    heading, *splits, read, speeds, agents, unused, wrote = outcome.out.splitlines()
     assert heading.split() == ["split", "scenes", "windows", "agents"]
     assert [line.split() for line in splits] == [
         ["train", "3", "6", "5-5"],
@@ -33,6 +33,7 @@ def test_a_set_is_written_and_told_of(cli: CommandLine, table: Path, tmp_path: P
     ]
     assert read == "read 1,500 rows of 5 scenes from 1 file"
     assert speeds.startswith("speeds in units per second: median 1.")
+    assert agents.startswith("agents: the same ones in all scenes, by their names; if they are not, import with --no-s")
     assert unused == f"rows in no window: {5 * 5 * (60 - 46)}"
     assert wrote == f"wrote {out}: hash {experts.hash[:16]}"
     assert outcome.err == "note: frames are numbered in steps of 5; windows count these steps\n"
@@ -53,6 +54,30 @@ def test_json_for_programs(cli: CommandLine, table: Path, tmp_path: Path) -> Non
         "observed": 8, "predicted": 12, "stride": 5, "most_agents": 3, "split": [3, 1, 1]
     }  # fmt: skip
     assert told["remarks"] == ["frames are numbered in steps of 5; windows count these steps"]
+
+
+def test_agents_may_be_others_in_every_scene(cli: CommandLine, table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "set.npz"
+    told = {}
+    for option in ("--same-agents", "--no-same-agents"):
+        outcome = cli("import-data", table, "--out", out, "--force", option)
+        told[option] = outcome.out.splitlines()[6]
+        outcome = cli("import-data", table, "--out", out, "--force", option, "--json")
+        same = expert_sets.load(out).parameters["identity"]
+        assert json.loads(outcome.out)["same_agents"] is same is (option == "--same-agents")
+    assert told["--same-agents"].startswith("agents: the same ones in all scenes, by their names;")
+    assert told["--no-same-agents"] == "agents: not the same ones in all scenes"
+
+
+def test_a_folder_is_imported_again_though_the_set_lies_in_it(cli: CommandLine, table: Path, tmp_path: Path) -> None:
+    out = tmp_path / "set.npz"
+    first = cli("import-data", tmp_path, "--out", out)
+    again = cli("import-data", tmp_path, "--out", out, "--force")
+    assert (first.code, again.code, again.out) == (0, 0, first.out)
+    assert f"leaving out {out}, which is the file to write" in again.err
+    assert "leaving out" not in first.err
+    other = cli("import-data", tmp_path, "--out", tmp_path / "other.npz")
+    assert "set.npz is an expert set already" in other.sentence
 
 
 @pytest.mark.parametrize("writer", ["write_boids", "write_coming_and_going", "write_boids_3d"])
@@ -88,6 +113,7 @@ def test_an_existing_file_is_kept(cli: CommandLine, table: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
+        ("--out set.csv", "--out set.csv does not end in .npz, as the name of an expert set does; choose another"),
         ("--split 70/30", "--split takes three shares such as 70/15/15, not '70/30'; none may be 0"),
         ("--split 70/30/0", "none may be 0"),
         ("--dt 0", "--dt takes the seconds of a step, not 0; give a positive number"),
@@ -105,7 +131,7 @@ def test_an_existing_file_is_kept(cli: CommandLine, table: Path, tmp_path: Path)
 def test_bad_options(cli: CommandLine, table: Path, tmp_path: Path, options: str, sentence: str) -> None:
     words = [word.replace("''", "") for word in options.split()]
     assert sentence in cli("import-data", table, "--out", tmp_path / "set.npz", *words).sentence
-    assert not (tmp_path / "set.npz").exists()
+    assert [path.name for path in tmp_path.iterdir()] == [table.name]
 
 
 def test_a_name_from_the_file_is_printed_harmlessly(cli: CommandLine, tmp_path: Path) -> None:

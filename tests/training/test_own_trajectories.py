@@ -1,6 +1,7 @@
 """Runs on own trajectories: a small set with two, three and four agents in two axes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from ssmail.config.experiments import build_spec
 from ssmail.config.names import METHODS
 from ssmail.config.spec import RunSpec
 from ssmail.data import expert_sets
+from ssmail.data.trajectories import LARGEST_JUMP, SPLITS, ExpertSet
 from ssmail.errors import InputError
 from ssmail.training.loop import TrainingLoop
 from ssmail.training.trajectory_evaluator import TrajectoryEvaluator
@@ -56,6 +58,31 @@ def test_every_method_trains_with_any_number_of_agents(make: Make, method: str) 
     if method in BASELINES:
         for name in ("fde", "energy", "mse_last", "coverage"):
             assert values[f"test/{name}"] == pytest.approx(values[f"test_{method.replace('-', '_')}/{name}"])
+
+
+def jumping(length: float) -> ExpertSet:
+    """A set in which an agent of a validation window and of a test window jumps so far, in spans of the velocities."""
+    made = generate([3], scenes=24, window=9, observed=4, frames=14)
+    splits = {split: getattr(made, split) for split in SPLITS}
+    for split in ("validation", "test"):
+        positions, velocities = splits[split].positions.copy(), splits[split].velocities.copy()
+        positions[0, 3:, 1, 0] += length * made.scaling.velocity_span
+        velocities[0, 3, 1, 0] += length * made.scaling.velocity_span
+        splits[split] = replace(
+            splits[split], positions=positions, velocities=velocities, continuations=positions[None]
+        )
+    return ExpertSet.bundle(splits, made.centre_lines, made.parameters, scenes=made.scenes)
+
+
+@pytest.mark.parametrize("method", ["bc", "dnri", "ssail"])
+def test_the_largest_jump_that_a_set_may_have_leaves_all_numbers_finite(tmp_path: Path, method: str) -> None:
+    assert not jumping(0.51 * LARGEST_JUMP).is_scalable
+    expert_sets.save(jumping(0.49 * LARGEST_JUMP), tmp_path / "a.npz")
+    spec = build_spec(method, "trajectories", "smoke", [f"data.path={tmp_path / 'a.npz'}", *SMALL, *SHORT])
+    loop = TrainingLoop(spec, 0)
+    values = loop.run_epoch() | loop.run_epoch() | loop.final_evaluation()[0]
+    assert values["test_constant_velocity/fde"] > 1e5
+    assert all(np.isfinite(value) for value in values.values())
 
 
 @pytest.mark.parametrize("curriculum", ["trajectory-forcing", "teacher-forcing", "scheduled-sampling"])

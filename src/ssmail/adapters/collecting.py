@@ -79,7 +79,8 @@ def expert_set(scenes: Sequence[Floats], options: ImportOptions | None = None) -
     """Make an expert set of the environment `trajectories` from the positions (F, N, P) of scenes, such as episodes.
 
     They are cut into windows and split by scene as `ssmail import-data` does it, with the same options; a window of T
-    states takes T + 1 frames. Row n counts as the same agent in all scenes. Raises InputError as it does.
+    states takes T + 1 frames. Row n counts as the same agent in all scenes if these have equally many agents, unless
+    `options.same_agents` is False. Raises InputError as it does.
     """
     if not scenes:
         raise InputError("an expert set needs scenes, and there are none; collect some episodes")

@@ -17,12 +17,20 @@ Integers = NDArray[np.int64]
 Booleans = NDArray[np.bool_]
 SPLITS = ("train", "validation", "test")
 LARGEST_SCALED = 1e6  # of scaled positions and velocities; those to train on are in [-1, 1]
+# The same of anyone's trajectories, in which agents may jump. Float32 holds the square of an error of this size, over
+# the least variance of a likelihood (1e-12), in sums of millions.
+LARGEST_JUMP = 1e9
 FIELDS = {  # environment -> the arrays of a split that are hashed and stored, in this order; the rest follows from them
     "yjunction": ("positions", "velocities", "mode", "continuations"),
     "letters": ("positions", "velocities", "mode"),
     "mocap": ("positions", "velocities", "mode", "trial", "frame"),
     "trajectories": ("positions", "velocities", "agents", "scene", "frame"),
 }
+
+
+def largest_scaled(environment: str) -> float:
+    """Return how large a scaled position or velocity of this environment may be."""
+    return LARGEST_JUMP if environment == "trajectories" else LARGEST_SCALED
 
 
 @dataclass(frozen=True)
@@ -146,7 +154,7 @@ class ExpertSet:
 
     @property
     def is_scalable(self) -> bool:
-        """Whether there is a scaling, and none of the numbers is larger than LARGEST_SCALED once scaled."""
+        """Whether there is a scaling, and none of the numbers is larger than `largest_scaled` once scaled."""
         try:
             scaling = self.scaling
         except ValueError:
@@ -158,16 +166,20 @@ class ExpertSet:
             velocities.append(ends(split.velocities, split.present))
         scaled = [scaling.scale_positions(end) for pair in positions for end in pair]
         scaled += [scaling.scale_velocities(end) for pair in velocities for end in pair]
-        return all(abs(value) <= LARGEST_SCALED for value in scaled)
+        return all(abs(value) <= largest_scaled(self.environment) for value in scaled)
 
-    def check_scaling(self, source: str, remedy: str) -> None:
-        """Raise InputError, with the remedy, if the numbers from this source cannot be scaled."""
+    def check_scaling(self, source: str, remedy: str, farthest: Callable[[], str] = str) -> None:
+        """Raise InputError, with the remedy, if the numbers from this source cannot be scaled.
+
+        farthest: what to add about the numbers that differ too much.
+        """
         try:
             _ = self.scaling
         except ValueError:
             raise InputError(f"nothing moves in the training windows of {source}; {remedy}") from None
         if not self.is_scalable:
-            raise InputError(f"the positions in {source} differ too much in size to be scaled alike; {remedy}")
+            which = farthest()
+            raise InputError(f"the positions in {source} differ too much in size to be scaled alike{which}; {remedy}")
 
 
 def generate_splits(

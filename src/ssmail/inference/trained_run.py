@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from ssmail.config.spec import RunSpec
 from ssmail.data.expert_sets import generate, load
 from ssmail.data.scaling import Scaling
-from ssmail.data.trajectories import LARGEST_SCALED, Floats
+from ssmail.data.trajectories import Floats, largest_scaled
 from ssmail.errors import InputError
 from ssmail.store import RunRow, Store
 from ssmail.store.checkpoint_files import BEST, LAST
@@ -132,7 +132,7 @@ class TrainedRun:
         states = np.concatenate([self.scaling.scale_positions(observed[:, 1:]), velocities], axis=-1)
         if self.predictor.features is None:  # nothing is learned, and nothing rounded
             return torch.as_tensor(states)
-        if np.abs(states).max() > LARGEST_SCALED:
+        if np.abs(states).max() > largest_scaled(self.spec.environment):
             raise InputError("the observed positions are far from all that the model was trained on; check the units.")
         return torch.as_tensor(states, dtype=torch.float32)
 

@@ -34,7 +34,29 @@ FAULTS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "a short line": (GOOD.replace("0,2,a,2.5,0", "0,2,a"), "a.csv, line 6: the column 'x' is empty or NaN", {}),
     "a long line": (GOOD.replace("0,2,a,2.5,0", "0,2,a,2,5,0"), "a.csv, line 6 has 6 values instead of 5", {}),
     "infinity": (GOOD.replace("2.5", "inf", 1), "a.csv, line 6: the column 'x' holds 'inf', which is too large", {}),
-    "no agent": (GOOD.replace("0,2,a,", "0,2,,"), "an agent in a.csv has no name; name each with 1 to 200", {}),
+    "no agent": (GOOD.replace("0,2,a,", "0,2,,"), "a.csv, line 6: an agent has no name; name each with 1 to 200", {}),
+    "no scene": (GOOD.replace("1,2,b,", " ,2,b,"), "a.csv, line 19: a scene has no name; name each with 1 to", {}),
+    "a long agent": (
+        GOOD.replace("1,2,b,", f"1,2,{'b' * 201},"),
+        "a.csv, line 19: an agent has a name of 201 characters; name each with 1 to 200",
+        {},
+    ),
+    "a date": (
+        GOOD.replace("0,2,a", "0,2026-11-28 17:07,a"),
+        "a.csv, line 6: the column 'frame' holds '2026-11-28 17:07', which is no number; frames are whole numbers from "
+        "0 on, or times in seconds if --dt gives the seconds of a frame",
+        {},
+    ),
+    "a comment": (
+        f"# made by us, today\n{GOOD}",
+        "a.csv has no column 'frame'; its first line must be the header, and has the columns # made by us, today",
+        {},
+    ),
+    "a header that is a comment": (
+        f"# {GOOD}".replace("scene,frame", "frame,scene"),
+        "a.csv has no column 'frame'; its first line must be the header, and has the columns # frame, scene, agent, x",
+        {},
+    ),
     "duplicate": (
         GOOD.replace("1,3,b", "1,2,b"),
         "a.csv, line 21: agent b in frame 2 of scene 1 is there already (a.csv, line 19); leave one out",
@@ -168,6 +190,7 @@ def test_sources_that_are_none(tmp_path: Path) -> None:
     np.savez(tmp_path / "two.npz", a=walks(), b=walks())
     for source, sentence in {
         "absent.csv": "there is no file",
+        "absent": "there is no file or folder .*absent; name another",
         "a.md": r"ends in none of \.csv, \.tsv, \.txt, \.parquet, \.npy, \.npz; save it as one of them",
         "two.npz": "holds 2 arrays, none of them called positions",
     }.items():
@@ -194,6 +217,13 @@ def test_parquet_faults(tmp_path: Path) -> None:
     refused(table.assign(x="east"), r"the column 'x' of .*a\.parquet holds .*string values, no numbers")
     refused(table.assign(x=table["x"].where(table.index != 9)), r"a\.parquet, row 10: the column 'x' is empty or NaN")
     refused(table.assign(agent=table["agent"].where(table.index != 9)), r"row 10: the column 'agent' is empty or NaN")
+    refused(
+        table.astype({"agent": str}).replace({"agent": {"1": ""}}), r"a\.parquet, row 2: an agent has no name; name"
+    )
+    refused(
+        table.assign(frame=pd.Timestamp("2026-11-28")),
+        r"the column 'frame' of .*a\.parquet holds .* values, no numbers; frames are whole numbers from 0 on, or times",
+    )
     refused(pd.concat([table, table[5:6]]), r"row 73: agent 1 in frame 2 of scene 0 is there already .*row 6\)")
     (tmp_path / "a.parquet").write_bytes((tmp_path / "a.parquet").read_bytes()[:-9])
     with pytest.raises(InputError, match=r"a\.parquet cannot be read as Parquet"):

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from ssmail.data import expert_sets
 from ssmail.data.importing import tables
 from ssmail.data.importing.tables import Columns
 from ssmail.data.mocap.amc import parse_motion
@@ -92,6 +93,25 @@ def test_a_folder_of_files_that_are_scenes(tmp_path: Path) -> None:
     assert (summary.files, summary.rows, len(experts.sources)) == (4, 72, 4)
 
 
+def test_hidden_files_of_a_folder_are_left_out(tmp_path: Path) -> None:
+    """As editors and notebooks make them; a folder that is hidden itself can be named."""
+    folder = tmp_path / ".data"
+    table_of(walks()).to_csv(folder_file(folder, "a.csv"), index=False)
+    before = imported(folder)[0]
+    for copy in (".ipynb_checkpoints/a-checkpoint.csv", "deep/.cache/a.csv", ".a.csv"):
+        folder_file(folder, copy).write_text("nothing,of,use\n")
+    experts, summary = imported(folder)
+    assert (summary.files, experts.sources, experts.hash) == (1, before.sources, before.hash)
+    folder_file(folder, "deep/cache/a.csv").write_text("nothing,of,use\n")
+    with pytest.raises(InputError, match="has no column 'frame'"):
+        imported(folder)
+
+
+def folder_file(folder: Path, name: str) -> Path:
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    return folder / name
+
+
 def test_columns_have_other_names_and_frames_are_times(tmp_path: Path) -> None:
     table = table_of(walks())
     table.to_csv(tmp_path / "a.csv", index=False)
@@ -115,7 +135,32 @@ def test_agents_are_ordered_by_number_and_the_same_only_if_they_are_in_all_windo
     assert experts.train.positions[0, 0, :, 0].tolist() == first.sort_values("agent")["x"].tolist()
     table.loc[(table["scene"] == 2) & (table["agent"] == 9), "agent"] = 11
     table.to_csv(tmp_path / "a.csv", index=False)
-    assert imported(tmp_path / "a.csv")[0].parameters["identity"] is False
+    experts, summary = imported(tmp_path / "a.csv")
+    assert experts.parameters["identity"] is summary.same_agents is False
+    with pytest.raises(InputError, match=r"--same-agents: agent (9|11) is in a window of scene .*; name the ag"):
+        imported(tmp_path / "a.csv", same_agents=True)
+
+
+def test_agents_of_the_same_name_may_be_others_in_every_scene(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", walks())
+    table_of(walks()).to_csv(tmp_path / "a.csv", index=False)
+    for source in (tmp_path / "a.npy", tmp_path / "a.csv"):
+        sets = {wanted: imported(source, same_agents=wanted) for wanted in (None, True, False)}
+        told = {wanted: summary.same_agents for wanted, (_, summary) in sets.items()}
+        assert told == {wanted: experts.parameters["identity"] for wanted, (experts, _) in sets.items()}
+        assert told == {None: True, True: True, False: False}
+        np.testing.assert_array_equal(sets[False][0].train.positions, sets[None][0].train.positions)
+        assert sets[False][0].hash != sets[None][0].hash == sets[True][0].hash
+
+
+def test_the_same_agents_are_wanted_where_they_come_and_go(tmp_path: Path) -> None:
+    table = table_of(walks(agents=3))
+    table[(table["scene"] != 1) | (table["agent"] != 2)].to_csv(tmp_path / "a.csv", index=False)
+    with pytest.raises(InputError) as caught:
+        imported(tmp_path / "a.csv", same_agents=True)
+    assert "agent 2 is in a window of scene " in str(caught.value)
+    assert "but not in one of scene 1; name the agents alike" in str(caught.value)
+    assert imported(tmp_path / "a.csv", most_agents=2, same_agents=False)[1].same_agents is False
 
 
 def test_one_scene_is_cut_by_time(tmp_path: Path) -> None:
@@ -183,6 +228,16 @@ def test_what_was_left_out_is_counted(tmp_path: Path) -> None:
     assert summary.left_out["rows in no window"] == 9 + 26
 
 
+def test_interpolated_frames_are_no_rows_in_no_window(tmp_path: Path) -> None:
+    """Windows take the frames 0 to 4 and 2 to 6; of the rows behind them, one is missing and filled in."""
+    table = table_of(walks(frames=9, agents=1))
+    late = (table["scene"] == 0) & (table["frame"] == 7)
+    table[~late].to_csv(tmp_path / "a.csv", index=False)
+    _, summary = imported(tmp_path / "a.csv", window=4, stride=100, fill_gaps=1)
+    assert summary.left_out["frames filled in"] == 1
+    assert summary.left_out["rows in no window"] == 4 * 4 - 1
+
+
 def test_a_jump_is_told_and_a_fast_agent_is_not(tmp_path: Path) -> None:
     positions = np.ones((4, 9, 1, 1)).cumsum(axis=1)
     positions[2, 5:] += 99
@@ -195,3 +250,30 @@ def test_a_jump_is_told_and_a_fast_agent_is_not(tmp_path: Path) -> None:
         "agents jump 1 times, faster than 100 times the median speed: agent 0 of scene a/2 by 101 "
     )
     assert "at frame 4;" in remark
+
+
+@pytest.mark.parametrize("scene", range(3))
+@pytest.mark.parametrize("length", [1e6, -1e7])
+def test_a_jump_is_told_in_every_split(tmp_path: Path, scene: int, length: float) -> None:
+    positions = walks(scenes=3) / 10
+    positions[scene, 5, 1, 0] += length
+    np.save(tmp_path / "a.npy", positions)
+    experts, summary = imported(tmp_path / "a.npy", validation=("a/1",), test=("a/2",))
+    (remark,) = summary.remarks
+    assert f"agents jump 2 times, faster than 100 times the median speed: agent 1 of scene a/{scene} by 1e+0" in remark
+    assert experts.is_scalable
+    expert_sets.save(experts, tmp_path / "set.npz")
+    assert expert_sets.load(tmp_path / "set.npz", "trajectories").hash == experts.hash
+
+
+def test_a_jump_beyond_all_arithmetic_is_refused_with_its_place(tmp_path: Path) -> None:
+    positions = walks(scenes=3) / 1000
+    positions[2, 5:, 1, 0] += 9e11
+    table_of(positions).to_csv(tmp_path / "a.csv", index=False)
+    with pytest.raises(InputError) as caught:
+        imported(tmp_path / "a.csv", validation=("1",), test=("2",))
+    sentence = str(caught.value).replace(str(tmp_path / "a.csv"), "a.csv")
+    assert sentence == (
+        "the positions in a.csv differ too much in size to be scaled alike: leave out errors such as the fastest step, "
+        "agent 1 of scene 2 by 9e+11 at frame 4; are these the right columns, and all in the same unit?"
+    )

@@ -11,7 +11,7 @@ from ssmail.data.importing.cutting import Windows, check_size, cut, longest, nea
 from ssmail.data.importing.rows import Rows, quoted
 from ssmail.data.importing.sources import find_files, read_files
 from ssmail.data.importing.splitting import Shares, named_scenes, split_scenes, split_times
-from ssmail.data.importing.summary import Summary, summarize
+from ssmail.data.importing.summary import Summary, fastest_step, summarize
 from ssmail.data.importing.tables import Columns
 from ssmail.data.importing.tracks import Tracks, make_tracks
 from ssmail.data.recorded_sets import SetParameters, recorded_set, windows
@@ -24,7 +24,8 @@ class ImportOptions:
     """How rows become windows. observed: of a window, half of it by default. stride: by default what is predicted.
 
     most_agents: of a window; None for all. validation, test: patterns of the names of these scenes, instead of the
-    shares of `split`. The other fields are those of SetParameters.
+    shares of `split`. same_agents: whether row n of all windows is the same agent; None for yes if all windows have
+    agents of the same names. The other fields are those of SetParameters.
     """
 
     columns: Columns = field(default_factory=Columns)
@@ -38,6 +39,7 @@ class ImportOptions:
     split: Shares = (70, 15, 15)
     validation: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
+    same_agents: bool | None = None
 
     def parameters(self, axes: int) -> SetParameters:
         """Return the parameters of a set. Raises InputError unless something of a window is observed and predicted."""
@@ -66,14 +68,18 @@ class ImportOptions:
 
 
 def import_set(
-    sources: Sequence[Path], options: ImportOptions, report: Callable[[str], None] = lambda _: None
+    sources: Sequence[Path],
+    options: ImportOptions,
+    report: Callable[[str], None] = lambda _: None,
+    out: Path | None = None,
 ) -> tuple[ExpertSet, Summary]:
-    """Make an expert set from files, or from all those in folders. report: is told of large files.
+    """Make an expert set from files, or from all those in folders. report: is told of large files, and of `out` if it
+    is left out because it lies in such a folder.
 
     Raises InputError for anything in the files that cannot be used, and if there is no window for each split.
     """
     options.parameters(1)  # refuse what cannot be before files are read
-    files = find_files(sources)
+    files = find_files(sources, report, out)
     rows, digests = read_files(files, options.columns, report)
     return set_of_rows(rows, options, quoted(sources[0], 80), digests)
 
@@ -92,7 +98,7 @@ def set_of_rows(
         parts = [nearest(part, params.most_agents, params.observed) for part in parts]
     agents = max(int(part.agents.max()) for part in parts)
     check_size(parts, agents)
-    params = params.model_copy(update={"identity": _alike(parts)})
+    params = params.model_copy(update={"identity": _same_agents(parts, rows, options.same_agents)})
     used, numbers = np.unique(np.concatenate([part.scene for part in parts]), return_inverse=True)
     scenes = [rows.scenes[scene] for scene in used]
     splits, begin = {}, 0
@@ -100,7 +106,10 @@ def set_of_rows(
         splits[split] = _trajectories(part, agents, numbers[begin : begin + len(part)])
         begin += len(part)
     experts = recorded_set(splits, scenes, params, digests)
-    experts.check_scaling(label, "are these the right columns, and all in the same unit?")
+    experts.check_scaling(
+        *(label, "are these the right columns, and all in the same unit?"),
+        lambda: f": leave out errors such as the fastest step, {fastest_step(tracks, rows)}",
+    )
     return experts, summarize(rows, tracks, repairs, parts, params)
 
 
@@ -149,13 +158,26 @@ def _no_window(tracks: Tracks, blocks: Sequence[tuple[Tracks, Integers]], params
     )
 
 
-def _alike(parts: Sequence[Windows]) -> bool:
-    """Return whether all windows have the same agents."""
-    numbers = np.concatenate([part.agents for part in parts])
-    if (numbers != numbers[0]).any():
-        return False
-    names = np.concatenate([part.names for part in parts]).reshape(len(numbers), numbers[0])
-    return bool((names == names[0]).all())
+def _same_agents(parts: Sequence[Windows], rows: Rows, wanted: bool | None) -> bool:
+    """Return whether the agents count as the same ones in all windows: as wanted, or by their names.
+
+    Raises InputError, with an agent that is missing somewhere, if that is wanted of windows with different names.
+    """
+    names, numbers, scenes = (
+        np.concatenate([getattr(part, field) for part in parts]) for field in ("names", "agents", "scene")
+    )
+    alike = bool((numbers == numbers[0]).all() and (names.reshape(len(numbers), -1) == names[: numbers[0]]).all())
+    if wanted and not alike:
+        groups = np.split(names, np.cumsum(numbers)[:-1])
+        other = next(window for window, group in enumerate(groups) if not np.array_equal(group, groups[0]))
+        agent = np.setxor1d(groups[0], groups[other])[0]
+        there, missing = (0, other) if agent in groups[0] else (other, 0)
+        raise InputError(
+            f"--same-agents: agent {quoted(rows.agents[agent])} is in a window of scene "
+            f"{quoted(rows.scenes[scenes[there]])}, but not in one of scene {quoted(rows.scenes[scenes[missing]])}; "
+            "name the agents alike, choose windows that all have them, or leave the option out"
+        )
+    return alike if wanted is None else wanted
 
 
 def _trajectories(part: Windows, agents: int, scene: Integers) -> Trajectories:

@@ -1,7 +1,9 @@
 """The rows of tables and arrays in compact columns, and where each came from."""
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +17,7 @@ MOST_ROWS = 2**27  # of all files together: 4 GiB
 MOST_NAMES = 2**20  # of scenes, and of agents
 LARGEST_POSITION = 1e12
 AXES = ("x", "y", "z")
+LARGEST_WHOLE = 2**53  # up to which a float64 holds every whole number
 Codes = NDArray[np.int32]
 
 
@@ -36,6 +39,19 @@ def quoted(text: object, length: int = 40) -> str:
     return shortened(printable(text), length)
 
 
+def plain_name(value: object) -> str:
+    """Return the name that a cell of a table holds: its text, but 1 for 1.0, as pandas writes a whole number.
+
+    It does so with a column of whole numbers in which some are missing. Any other text is kept as it is: 007, 1e3 and
+    1_1 are names of their own, and so is a number that is too large for float64 to hold every digit.
+    """
+    name = str(value).strip()
+    whole = name.removesuffix(".0")
+    if whole != name and re.fullmatch("0|-?[1-9][0-9]{0,15}", whole) and abs(int(whole)) <= LARGEST_WHOLE:
+        return whole
+    return name
+
+
 @dataclass
 class Names:
     """The names of scenes or agents, and the number of each in the order in which they come."""
@@ -43,13 +59,17 @@ class Names:
     what: str
     numbers: dict[str, int] = field(default_factory=dict)
 
-    def number(self, names: Iterable[object], label: str) -> Codes:
-        """Return the numbers of names; new names get the next ones. Raises InputError for an empty or long name."""
+    def number(self, names: Iterable[object], label: str, locate: Callable[[int], str] | None = None) -> Codes:
+        """Return the numbers of names; new names get the next ones. locate: where the n-th of the names is in the file.
+
+        Raises InputError for an empty or long name, with the place.
+        """
         found = []
-        for name in (printable(str(name).strip()) for name in names):
+        for index, name in enumerate(printable(str(name).strip()) for name in names):
             if not 0 < len(name) <= LONGEST_NAME:
                 what = f"has a name of {len(name)} characters" if name else "has no name"
-                raise InputError(f"{self.what} in {label} {what}; name each with 1 to {LONGEST_NAME} characters")
+                place = f"{label}, {locate(index)}" if locate else label
+                raise InputError(f"{place}: {self.what} {what}; name each with 1 to {LONGEST_NAME} characters")
             found.append(self.numbers.setdefault(name, len(self.numbers)))
         if len(self.numbers) > MOST_NAMES:
             raise InputError(f"{label} has more than {MOST_NAMES:,} names of {self.what}; is it the right column?")
@@ -60,9 +80,9 @@ class Names:
 class Rows:
     """R rows: one agent in one frame.
 
-    scene, agent: (R,) index into `scenes` and `agents`, the names in their order: by number if all are numbers, else by
-    letters. frame: (R,) as read, which may be times. positions: (R, P). files: each with how many rows there are up to
-    its end, and what says where a row of it is.
+    scene, agent: (R,) index into `scenes` and `agents`, the names in their order: by number if all are numbers in
+    digits, else by letters. frame: (R,) as read, which may be times. positions: (R, P). files: each with how many rows
+    there are up to its end, and what says where a row of it is.
     """
 
     scene: Codes
@@ -126,14 +146,15 @@ class RowCollector:
 
 
 def _ordered(numbers: dict[str, int]) -> tuple[tuple[str, ...], Codes]:
-    """Return the names in their order, and for each number the place of its name there. 1 and 1.0 are one name."""
-    names = list(numbers)
-    try:
-        values = np.array(names, dtype=np.float64)
-    except ValueError:
-        values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        unique, places = np.unique(np.array(names), return_inverse=True)
-        return tuple(unique.tolist()), places.astype(np.int32)
-    distinct, places = np.unique(values, return_inverse=True)
-    return tuple(f"{value:.15g}" for value in distinct), places.astype(np.int32)
+    """Return the names in their order, and for each number the place of its name there."""
+    key = None
+    if all(re.fullmatch(r"[-+]?[0-9]+(\.[0-9]*)?", name) for name in numbers):
+        key = _by_number
+    names = tuple(sorted(numbers, key=key))
+    places = np.empty(len(names), dtype=np.int32)
+    places[[numbers[name] for name in names]] = np.arange(len(names))
+    return names, places
+
+
+def _by_number(name: str) -> tuple[Decimal, str]:
+    return Decimal(name), name

@@ -18,21 +18,31 @@ ARRAYS = (".npy", ".npz")
 SUFFIXES = (*TABLES, *ARRAYS)
 
 
-def find_files(sources: Sequence[Path]) -> list[SourceFile]:
+def find_files(
+    sources: Sequence[Path], report: Callable[[str], None] = lambda _: None, out: Path | None = None
+) -> list[SourceFile]:
     """Return the given files, and those with a known suffix anywhere in the given folders, in the order of their names.
 
-    A file's scene is its path without the suffix, from the folder on. Raises InputError if there are no files or too
-    many, or if one is of an unknown kind or there twice.
+    Of a folder, hidden files and folders are left out, and so is `out`, the file to write, which is reported. A file's
+    scene is its path without the suffix, from the folder on. Raises InputError if there are no files or too many, or if
+    one is missing, of an unknown kind or there twice.
     """
     found: list[SourceFile] = []
     for source in sources:
         if source.is_dir():
-            paths = sorted(path for path in source.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+            paths = _inside(source)
+            if out is not None and out.exists():
+                own = [path for path in paths if path.samefile(out)]
+                paths = [path for path in paths if path not in own]
+                for path in own:
+                    report(f"leaving out {quoted(path, 80)}, which is the file to write")
             if not paths:
                 raise InputError(f"no file in {quoted(source, 80)} ends in one of {', '.join(SUFFIXES)}; name another")
             found += [SourceFile(path, path.relative_to(source).with_suffix("").as_posix()) for path in paths]
         elif source.suffix.lower() in SUFFIXES:
             found.append(SourceFile(source, source.stem))
+        elif not source.exists():
+            raise InputError(f"there is no file or folder {quoted(source, 80)}; name another")
         else:
             raise InputError(f"{quoted(source, 80)} ends in none of {', '.join(SUFFIXES)}; save it as one of them")
     if len(found) > MOST_FILES:
@@ -46,6 +56,12 @@ def find_files(sources: Sequence[Path]) -> list[SourceFile]:
         twice = next(scene for number, scene in enumerate(scenes) if scene in scenes[:number])
         raise InputError(f"two files are called {quoted(twice, 80)}, apart from their suffix; name each once")
     return found
+
+
+def _inside(folder: Path) -> list[Path]:
+    """Return the files of a folder with a known suffix, at any depth, without the hidden ones."""
+    found = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    return sorted(path for path in found if not any(part.startswith(".") for part in path.relative_to(folder).parts))
 
 
 def read_files(

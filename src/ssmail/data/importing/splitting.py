@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ssmail.data.importing.rows import quoted
+from ssmail.data.importing.rows import plain_name, quoted
 from ssmail.data.importing.tracks import Tracks
 from ssmail.data.trajectories import SPLITS, Integers
 from ssmail.errors import InputError, unknown_name
@@ -47,6 +47,7 @@ def named_scenes(names: Sequence[str], validation: Sequence[str], test: Sequence
     split = np.zeros(len(names), dtype=np.int64)
     for number, patterns in ((1, validation), (2, test)):
         for pattern in patterns:
+            pattern = plain_name(pattern)
             matching = [scene for scene, name in enumerate(names) if fnmatch.fnmatchcase(name, pattern)]
             if not matching:
                 raise unknown_name("scene", pattern, names)

@@ -16,14 +16,15 @@ from ssmail.data.trajectories import SPLITS
 class Summary:
     """What came in. speeds: median, 99 % and maximum of the speeds, in units per step, or per second with dt.
 
-    splits: split -> its scenes, windows, and the least and most agents of a window. left_out: what -> how many.
-    remarks: sentences about what may be a mistake.
+    splits: split -> its scenes, windows, and the least and most agents of a window. same_agents: whether the agents are
+    taken as the same ones in all scenes. left_out: what -> how many. remarks: sentences about what may be a mistake.
     """
 
     files: int
     rows: int
     scenes: int
     splits: Mapping[str, Mapping[str, int]]
+    same_agents: bool
     speeds: Mapping[str, float]
     left_out: Mapping[str, int]
     remarks: Sequence[str]
@@ -37,6 +38,7 @@ def summarize(rows: Rows, tracks: Tracks, repairs: Repairs, parts: Sequence[Wind
         len(rows),
         len(rows.scenes),
         {split: _counts(part) for split, part in zip(SPLITS, parts, strict=True)},
+        params.identity,
         _speeds(tracks, params),
         _left_out(tracks, repairs, parts, len(rows.scenes) - len(used)),
         _remarks(tracks, rows, params),
@@ -59,7 +61,7 @@ def _speeds(tracks: Tracks, params: SetParameters) -> dict[str, float]:
 
 
 def _left_out(tracks: Tracks, repairs: Repairs, parts: Sequence[Windows], scenes: int) -> dict[str, int]:
-    """Return what was left out, and what was filled in, with how many there are."""
+    """Return what was left out, and what was filled in, with how many there are. Rows are those that were read."""
     ends = np.zeros(len(tracks.positions) + 1, dtype=np.int64)
     for part in parts:
         np.add.at(ends, part.rows, 1)
@@ -72,7 +74,7 @@ def _left_out(tracks: Tracks, repairs: Repairs, parts: Sequence[Windows], scenes
         "scenes without a window": scenes,
         "windows with too few agents": sum(part.few for part in parts),
         "agents of windows beyond --agents": sum(part.crowded for part in parts),
-        "rows in no window": int((np.cumsum(ends[:-1]) == 0).sum()),
+        "rows in no window": int((repairs.measured & (np.cumsum(ends[:-1]) == 0)).sum()),
     }
 
 
@@ -86,17 +88,25 @@ def _remarks(tracks: Tracks, rows: Rows, params: SetParameters) -> list[str]:
     if (steps := np.unique(tracks.step)).max() > 1:
         numbers = ", ".join(map(str, steps[:5]))
         remarks.append(f"frames are numbered in steps of {numbers}; windows count these steps")
-    found, begins = speeds(tracks)
+    found, _ = speeds(tracks)
     moving = found[found > 0]
-    jumps = np.flatnonzero(found > JUMP * np.median(moving)) if len(moving) else np.empty(0, dtype=np.int64)
-    if len(jumps):
-        fastest = jumps[found[jumps].argmax()]
-        track = int(np.searchsorted(tracks.row, begins[fastest], side="right")) - 1
-        scene = tracks.scene[track]
-        step = tracks.begin[track] + begins[fastest] - tracks.row[track]
+    jumps = int((found > JUMP * np.median(moving)).sum()) if len(moving) else 0
+    if jumps:
         remarks.append(
-            f"agents jump {len(jumps)} times, faster than {JUMP} times the median speed: agent "
-            f"{quoted(rows.agents[tracks.agent[track]])} of scene {quoted(rows.scenes[scene])} by {found[fastest]:.4g} "
-            f"at frame {tracks.first[scene] + step * tracks.step[scene]}; if these are errors, leave the rows out"
+            f"agents jump {jumps} times, faster than {JUMP} times the median speed: {fastest_step(tracks, rows)}; if "
+            "these are errors, leave the rows out"
         )
     return remarks
+
+
+def fastest_step(tracks: Tracks, rows: Rows) -> str:
+    """Name the agent, scene and frame of the fastest step, and its distance."""
+    found, begins = speeds(tracks)
+    fastest = found.argmax()
+    track = int(np.searchsorted(tracks.row, begins[fastest], side="right")) - 1
+    scene = tracks.scene[track]
+    step = tracks.begin[track] + begins[fastest] - tracks.row[track]
+    return (
+        f"agent {quoted(rows.agents[tracks.agent[track]])} of scene {quoted(rows.scenes[scene])} by "
+        f"{found[fastest]:.4g} at frame {tracks.first[scene] + step * tracks.step[scene]}"
+    )

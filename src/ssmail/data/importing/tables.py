@@ -4,7 +4,7 @@ import csv
 import io
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssmail.config.foreign_files import open_regular
-from ssmail.data.importing.rows import AXES, LARGEST_POSITION, Codes, RowCollector, SourceFile, quoted
+from ssmail.data.importing.rows import (
+    AXES,
+    LARGEST_POSITION,
+    LARGEST_WHOLE,
+    Codes,
+    Names,
+    RowCollector,
+    SourceFile,
+    plain_name,
+    quoted,
+)
 from ssmail.data.trajectories import Floats
 from ssmail.errors import InputError, shortened
 
@@ -22,6 +32,7 @@ PIECE = 500_000  # rows that are read at once
 LONGEST_HEADER = 2**16  # bytes
 MOST_COLUMNS = 2000
 LARGEST_NUMBER = 1e18  # of a frame or time
+FRAMES = "frames are whole numbers from 0 on, or times in seconds if --dt gives the seconds of a frame"
 MISSING = ("", "nan", "na", "n/a", "null", "none")
 
 
@@ -53,6 +64,11 @@ class Columns:
                     raise InputError(f"{label} has several columns {quoted(column)!r}; rename one of them")
             elif name is not None or role in ("x", "frame", "agent"):
                 there = shortened(", ".join(map(quoted, header)), 120)
+                if header[0].startswith("#"):
+                    raise InputError(
+                        f"{label} has no column {quoted(column)!r}; its first line must be the header, and has the "
+                        f"columns {there}; remove comments before it, and the #"
+                    )
                 raise InputError(
                     f"{label} has no column {quoted(column)!r}, only {there}; name the one that it is with --{role}"
                 )
@@ -73,18 +89,20 @@ def read_csv(file: SourceFile, columns: Columns, collector: RowCollector) -> Non
     with open_regular(file.path) as opened:
         header, separator = _header(opened, file.label)
         places = columns.among(header, file.label)
+        line, before = partial(_line, file.path, separator), 0
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of an empty column at the end of each line
                 for piece in _pieces(opened, places, len(header), separator):
-                    _add(piece, file, list(places), collector)
+                    _add(piece, file, list(places), collector, before, line)
+                    before += len(piece)
         except (pd.errors.ParserError, pd.errors.EmptyDataError) as error:
             raise _malformed(error, file.label) from None
         except UnicodeDecodeError:
             raise InputError(f"{file.label} is not UTF-8 text; save it with this encoding") from None
         except (ValueError, OverflowError):
             raise _first_fault(file, header, places, separator) from None
-    collector.end(file, partial(_line, file.path, separator))
+    collector.end(file, line)
 
 
 def _header(opened: IO[bytes], label: str) -> tuple[list[str], str]:
@@ -115,12 +133,15 @@ def _header(opened: IO[bytes], label: str) -> tuple[list[str], str]:
 
 
 def _pieces(opened: IO[bytes], places: dict[str, int], width: int, separator: str, text: bool = False) -> Iterator[Any]:
-    """Read the columns in pieces of PIECE rows, numbers as such, or all as text."""
+    """Read the columns in pieces of PIECE rows, numbers as such, or all as text.
+
+    Names are read as text: as categories, pandas would take those that are all numbers as such, and merge some.
+    """
     import pandas as pd
 
     opened.seek(0)
     whole = len(places) == width  # then pandas notices a line that has more values than the header
-    kinds: dict[str, Any] = {role: "category" if role in ("scene", "agent") else np.float64 for role in places}
+    kinds: dict[str, Any] = {role: object if role in ("scene", "agent") else np.float64 for role in places}
     return iter(
         pd.read_csv(
             opened,
@@ -138,8 +159,15 @@ def _pieces(opened: IO[bytes], places: dict[str, int], width: int, separator: st
     )
 
 
-def _add(piece: Any, file: SourceFile, roles: list[str], collector: RowCollector) -> None:
-    """Add a piece of a table. Raises ValueError if there is a number in it that cannot be."""
+def _add(
+    piece: Any, file: SourceFile, roles: list[str], collector: RowCollector, before: int, locate: Callable[[int], str]
+) -> None:
+    """Add a piece of a table. before: the rows of the file before it. locate: where the n-th row of the file is.
+
+    Raises ValueError if there is a number in it that cannot be, and InputError, with the place, for a name.
+    """
+    import pandas as pd
+
     axes = [axis for axis in AXES if axis in roles]
     positions: Floats = np.stack([piece[axis].to_numpy() for axis in axes], axis=-1)
     frame: Floats = piece["frame"].to_numpy()
@@ -147,17 +175,21 @@ def _add(piece: Any, file: SourceFile, roles: list[str], collector: RowCollector
         raise ValueError
     if not len(frame):
         return
-    agent = _numbered(piece["agent"].cat, collector, file, "agents")
+
+    def numbered(role: str, names: Names) -> Codes:
+        codes, found = pd.factorize(piece[role])
+
+        def place(index: int) -> str:
+            return locate(before + int((codes == index).argmax()))
+
+        return names.number(map(plain_name, found), file.label, place)[codes]
+
+    agent = numbered("agent", collector.agents)
     if "scene" in roles:
-        scene = _numbered(piece["scene"].cat, collector, file, "scenes")
+        scene = numbered("scene", collector.scenes)
     else:
         scene = np.full(len(frame), collector.scenes.number([file.scene], file.label)[0])
     collector.add(file, scene, frame, agent, positions)
-
-
-def _numbered(category: Any, collector: RowCollector, file: SourceFile, what: str) -> Codes:
-    numbers: Codes = getattr(collector, what).number(category.categories, file.label)[category.codes]
-    return numbers
 
 
 def _malformed(error: Exception, label: str) -> InputError:
@@ -184,7 +216,7 @@ def _first_fault(file: SourceFile, header: list[str], places: dict[str, int], se
             if faults:
                 row, role = min(faults)
                 place = f"{file.label}, {_line(file.path, separator, before + row)}"
-                return unusable(piece[role].iloc[row], place, header[places[role]])
+                return unusable(piece[role].iloc[row], place, header[places[role]], role)
             before += len(piece)
     return InputError(f"{file.label} holds numbers that cannot be read; save it again as CSV")
 
@@ -195,14 +227,14 @@ def _usable(numbers: Floats, role: str) -> NDArray[np.bool_]:
     return usable
 
 
-def unusable(value: object, place: str, column: str) -> InputError:
-    """Return what to say of a value that should be a number."""
+def unusable(value: object, place: str, column: str, role: str) -> InputError:
+    """Return what to say of a value that should be a number. role: the field of Columns that the column is."""
     text = str(value).strip()
     if text.lower() in MISSING:
         reason, remedy = "is empty or NaN", "leave the row out; --fill-gaps interpolates missing frames"
     else:
         reason = f"holds {quoted(text, 24)!r}, which is {'too large' if _is_number(text) else 'no number'}"
-        remedy = "correct it, or leave the row out"
+        remedy = FRAMES if role == "frame" and not _is_number(text) else "correct it, or leave the row out"
     return InputError(f"{place}: the column {quoted(column)!r} {reason}; {remedy}")
 
 
@@ -253,7 +285,7 @@ def read_parquet(file: SourceFile, columns: Columns, collector: RowCollector) ->
             raise InputError(
                 f"{file.label} cannot be read as Parquet ({quoted(error, 80)}); write the file again"
             ) from None
-    collector.end(file, lambda row: f"row {row + 1}")
+    collector.end(file, _row)
 
 
 def _add_arrow(
@@ -266,21 +298,35 @@ def _add_arrow(
     columns: dict[str, Any] = {}
     for role, array in arrays.items():
         if role in ("scene", "agent"):
-            if array.null_count:
-                row = before + int(np.argmax(array.is_null()))
-                raise unusable("", f"{file.label}, row {row + 1}", names[role])
-            coded = array.cast(pa.string()).dictionary_encode()
-            columns[role] = pd.Categorical.from_codes(coded.indices.to_numpy(), coded.dictionary.to_pylist())
+            missing = np.asarray(array.is_null(nan_is_null=True))
+            if missing.any():
+                raise unusable("", f"{file.label}, row {before + int(missing.argmax()) + 1}", names[role], role)
+            floats = pa.types.is_floating(array.type)
+            coded = (array if floats else array.cast(pa.string())).dictionary_encode()
+            texts = coded.dictionary.cast(pa.string()).to_pylist()
+            if floats:
+                values = coded.dictionary.to_pylist()
+                texts = [_whole(value) or text for value, text in zip(values, texts, strict=True)]
+            columns[role] = pd.Categorical.from_codes(coded.indices.to_numpy(), texts)
             continue
         if not (pa.types.is_integer(array.type) or pa.types.is_floating(array.type)):
             raise InputError(
                 f"the column {quoted(names[role])!r} of {file.label} holds {quoted(array.type)} values, no numbers; "
-                "convert it to numbers"
+                + (FRAMES if role == "frame" else "convert it to numbers")
             )
         numbers = array.to_numpy(zero_copy_only=False).astype(np.float64)
         wrong = ~_usable(numbers, role)
         if wrong.any():
             row = int(wrong.argmax())
-            raise unusable(array[row].as_py() or "", f"{file.label}, row {before + row + 1}", names[role])
+            raise unusable(array[row].as_py() or "", f"{file.label}, row {before + row + 1}", names[role], role)
         columns[role] = numbers
-    _add(pd.DataFrame(columns, copy=False), file, list(arrays), collector)
+    _add(pd.DataFrame(columns, copy=False), file, list(arrays), collector, before, _row)
+
+
+def _row(row: int) -> str:
+    return f"row {row + 1}"
+
+
+def _whole(value: float) -> str:
+    """Return a float that is a whole number in digits, with .0 as in CSV; "" for others."""
+    return f"{value:.1f}" if abs(value) <= LARGEST_WHOLE and value % 1 == 0 else ""

@@ -49,12 +49,16 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Repairs:
-    """What became of the rows: frames interpolated in so many gaps, tracks cut at others, rows between the steps."""
+    """What became of the rows: frames interpolated in so many gaps, tracks cut at others, rows between the steps.
+
+    measured: (R,) which positions of the tracks are of rows, and not interpolated.
+    """
 
     gaps_filled: int
     frames_filled: int
     gaps_cut: int
     off_step: int
+    measured: NDArray[np.bool_]
 
 
 def make_tracks(rows: Rows, dt: float | None, fill_gaps: int) -> tuple[Tracks, Repairs]:
@@ -94,8 +98,11 @@ def make_tracks(rows: Rows, dt: float | None, fill_gaps: int) -> tuple[Tracks, R
         raise InputError(f"filled gaps make more than {MOST_ROWS:,} rows; lower --fill-gaps")
     breaks = np.flatnonzero(np.append(True, ~same | (missing > fill_gaps)))
     length = np.add.reduceat(repeats, breaks)
+    measured = np.zeros(int(repeats.sum()), dtype=bool)
+    measured[np.cumsum(repeats) - repeats] = True
     repairs = Repairs(
-        int(filled.sum()), int(missing[filled].sum()), int((missing > fill_gaps).sum()), len(rows) - len(order)
+        *(int(filled.sum()), int(missing[filled].sum()), int((missing > fill_gaps).sum())),
+        *(len(rows) - len(order), measured),
     )
     tracks = Tracks(
         *(scene[breaks], agent[breaks], tick[breaks], length, np.cumsum(length) - length),
