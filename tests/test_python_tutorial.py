@@ -49,7 +49,10 @@ def test_the_tutorial_runs(empty: Path, capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.mark.slow
 def test_the_tutorial_runs_with_the_wheel_alone(tmp_path: Path) -> None:
-    """In a fresh virtual environment, with no repository beside it: commands first, then the Python of all blocks."""
+    """In a fresh virtual environment, with no repository beside it.
+
+    The first block of Python, which writes the table, then the commands, then the Python of all blocks.
+    """
     folder = tmp_path / "empty"
     folder.mkdir()
     hidden = ("PYTHON", "SSMAIL", "VIRTUAL_ENV")
@@ -67,6 +70,8 @@ def test_the_tutorial_runs_with_the_wheel_alone(tmp_path: Path) -> None:
     output(sys.executable, "-m", "venv", tmp_path / "venv")
     programs = tmp_path / "venv" / "bin"
     output(programs / "python", "-m", "pip", "install", "--no-compile", "-c", ROOT / "constraints.txt", wheel)
+    assert BLOCKS[0][0] == "python"
+    output(programs / "python", "-c", BLOCKS[0][1])
     run_id = EXAMPLE
     for line in "".join(block for language, block in BLOCKS if language == "sh").splitlines():
         output(programs / "ssmail", *shlex.split(line.replace(EXAMPLE, run_id))[1:])
