@@ -299,12 +299,7 @@ def film(
     run: OneRun,
     window: Annotated[
         int | None,
-        typer.Option(
-            "--window",
-            min=0,
-            help="Of a forecast: index in the test split of a window that the run stored.",
-            show_default="the first",
-        ),
+        typer.Option("--window", min=0, help="Of a forecast: index of a stored test window.", show_default="the first"),
     ] = None,
 ) -> None:
     """The learned reward of a run on a plane, over training; or a forecast of a run, over its steps (GIF)."""
