@@ -52,8 +52,8 @@ def test_a_window_goes_by_its_index_in_the_test_split(
         "test window 12 (2 agents)\nscene siü\\n, frame 120",
     ]
     table = record.table()
-    assert [*table.columns] == ["window", "scene", "first_frame", "kind", "sample", "agent", "step", "x", "y"]
-    assert {*zip(table["window"], table["scene"], table["first_frame"], strict=True)} == {
+    assert [*table.columns] == ["window", "scene", "start", "kind", "sample", "agent", "step", "x", "y"]
+    assert {*zip(table["window"], table["scene"], table["start"], strict=True)} == {
         (24, "siiü\\n", 240),
         (12, "siü\\n", 120),
     }

@@ -54,7 +54,7 @@ class TrajectoriesRecord:
     def table(self) -> pd.DataFrame:
         """[window, kind, sample, agent, step, x, ...]; kind: observed, true, sampled (others have sample -1).
 
-        Where the run stored them, scene and first_frame stand beside the window.
+        Where the run stored them, scene and start (its first frame) stand beside the window.
         """
         return pd.concat([rows for window in self.windows for rows in window.rows()], ignore_index=True)
 

@@ -120,9 +120,9 @@ class Window:
     def rows(self) -> Iterator[pd.DataFrame]:
         """Yield [window, kind, sample, agent, step, x, ...] of observed, true and sampled positions.
 
-        Where known, there are the scene and first_frame of the window, too.
+        Where known, there are the scene and the first frame (start) of the window, too.
         """
-        where = {} if self.scene is None else {"scene": self.scene, "first_frame": self.frame}
+        where = {} if self.scene is None else {"scene": self.scene, "start": self.frame}
         for kind, positions, first in (
             ("observed", self.observed[None], self.first_step),
             ("true", self.future[None], 1),
