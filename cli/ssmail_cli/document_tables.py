@@ -24,9 +24,8 @@ def latex(cells: Sequence[Sequence[str]], headings: Sequence[str], numeric: Sequ
 def markdown(cells: Sequence[Sequence[str]], headings: Sequence[str], numeric: Sequence[bool]) -> str:
     """Return a pipe table; columns of numbers are aligned to the right."""
     rules = ["---:" if right else "---" for right in numeric]
-    return "\n".join(
-        f"| {' | '.join(row)} |" for row in (map(_marked, headings), rules, *(map(_marked, c) for c in cells))
-    )
+    lines = (map(markdown_text, headings), rules, *(map(markdown_text, row) for row in cells))
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def is_numeric(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
@@ -34,5 +33,6 @@ def is_numeric(rows: Sequence[Mapping[str, Any]], key: str) -> bool:
     return any(isinstance(row.get(key), int | float) for row in rows)
 
 
-def _marked(text: str) -> str:
+def markdown_text(text: str) -> str:
+    """Return the text as Markdown that shows it as it is."""
     return _MARKUP.sub(r"\\\1", printable(text))

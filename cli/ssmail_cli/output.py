@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any, Literal, TextIO
 
 from ssmail.data.atomic_file import atomic_write
 from ssmail.errors import InputError, SsmailError, masked, printable, sentence, shortened
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 WIDEST = 120  # columns of running text, however wide the terminal is
 LONGEST_CELL = 4000  # characters in a table; a traceback has fewer
+FOLDED = 24  # characters of a cell in a line, where a table is too wide
 Row = Mapping[str, Any]
 
 
@@ -152,27 +153,31 @@ def short(value: Any, digits: int = 4) -> str:
     return shortened(str(value), LONGEST_CELL)
 
 
-def print_table(rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence[str] = ()) -> None:
+def print_table(
+    rows: Sequence[Row], columns: Mapping[str, str], spare: Sequence[str] = (), *, fold: bool = False
+) -> None:
     """Print a table: two spaces between columns and four digits; in a narrow terminal one space, then three digits.
 
-    If that is not enough, the columns of `spare` are left out, the first ones first, and a line says so.
+    If that is not enough, with `fold` cells are broken before a ± and at FOLDED characters. Then the columns of `spare`
+    are left out, the first ones first, and a line says so.
     """
     from rich.console import Console
     from rich.measure import Measurement
 
     console = Console()
     unlimited = console.options.update(max_width=10_000)
-    narrower = [(2, 4, ()), (1, 4, ()), *((1, 3, spare[:count]) for count in range(len(spare) + 1))]
-    for gap, digits, without in narrower:
+    narrower: list[tuple[int, int, bool, Sequence[str]]] = [(2, 4, False, ()), (1, 4, False, ()), (1, 3, False, ())]
+    narrower += [(1, 3, fold, spare[:count]) for count in range(len(spare) + 1)]
+    for gap, digits, broken, without in narrower:
         shown = {key: heading for key, heading in columns.items() if key not in without}
-        table = _table(rows, shown, gap, digits)
+        table = _table(rows, shown, gap, digits, broken)
         if Measurement.get(console, unlimited, table).maximum <= console.width:
             break
     with console.capture() as capture:
         console.print(table)
     sys.stdout.write(capture.get())
     if len(shown) < len(columns):
-        left_out = [heading.replace("\n", " ") for key, heading in columns.items() if key not in shown]
+        left_out = [_one_line(heading) for key, heading in columns.items() if key not in shown]
         say(*textwrap.wrap(f"left out, as the terminal is narrow: {', '.join(left_out)}", console.width))
 
 
@@ -180,14 +185,19 @@ def print_document_table(rows: Sequence[Row], columns: Mapping[str, str], form: 
     """Print a table as LaTeX or Markdown, with four digits."""
     from ssmail_cli import document_tables
 
-    headings = [heading.replace("/\n", "/").replace("\n", " ") for heading in columns.values()]
+    headings = [_one_line(heading) for heading in columns.values()]
     numeric = [document_tables.is_numeric(rows, key) for key in columns]
     cells = [[short(row.get(key)) for key in columns] for row in rows]
     written = document_tables.latex if form is Format.LATEX else document_tables.markdown
     sys.stdout.write(written(cells, headings, numeric) + "\n")
 
 
-def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int) -> "Table":
+def _one_line(heading: str) -> str:
+    return heading.replace("/\n", "/").replace("\n_", "_").replace("\n", " ")
+
+
+def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: int, broken: bool) -> "Table":
+    from rich.align import Align
     from rich.table import Table
     from rich.text import Text
 
@@ -195,9 +205,14 @@ def _table(rows: Sequence[Row], columns: Mapping[str, str], gap: int, digits: in
     for key, heading in columns.items():
         numeric = any(isinstance(row.get(key), int | float) for row in rows)
         lines = Text("\n".join(map(printable, heading.split("\n"))))  # unlike a str, a Text is not read as markup
-        table.add_column(lines, justify="right" if numeric else "left", overflow="fold", vertical="bottom")
+        justify: Literal["left", "right"] = "right" if numeric else "left"
+        heads = Align(lines, justify, vertical="bottom")
+        place: Literal["top", "bottom"] = "top" if broken else "bottom"
+        most = FOLDED if broken else None
+        table.add_column(heads, justify=justify, overflow="fold", vertical=place, max_width=most)
     for row in rows:
-        table.add_row(*(Text(printable(short(row.get(key), digits))) for key in columns))
+        cells = [printable(short(row.get(key), digits)) for key in columns]
+        table.add_row(*(Text(cell.replace(" ± ", "\n± ") if broken else cell) for cell in cells))
     return table
 
 

@@ -261,7 +261,7 @@ def trajectories(
         typer.Option(
             "--window",
             min=0,
-            help="Number of a test window among those that the run stored; repeatable.",
+            help="Index in the test split, as in `ssmail forecast`, of a window that the run stored; repeatable.",
             show_default="the first four",
         ),
     ] = None,
@@ -299,7 +299,7 @@ def film(
     run: OneRun,
     window: Annotated[
         int | None,
-        typer.Option("--window", min=0, help="Number of the test window, of a forecast.", show_default="the first"),
+        typer.Option("--window", min=0, help="Of a forecast: index of a stored test window.", show_default="the first"),
     ] = None,
 ) -> None:
     """The learned reward of a run on a plane, over training; or a forecast of a run, over its steps (GIF)."""

@@ -1,7 +1,7 @@
 """Stored runs as rows to print, and the metrics shown of each environment."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -14,12 +14,16 @@ class EnvironmentMetrics:
 
     error: the test error of a finished run. validation: the error of an epoch. curve: drawn by `ssmail plot training`.
     compared: shown by `ssmail runs compare`, each with its heading in the table of a training command (None: none).
+    beside: rows that its tables have beside the specs, with the prefix under which every run stores their metrics.
+    spare: what its tables leave out first in a narrow terminal.
     """
 
     error: str
     validation: str
     curve: str
     compared: Mapping[str, str | None]
+    beside: Mapping[str, str] = field(default_factory=dict)
+    spare: Sequence[str] = ()
 
 
 ENVIRONMENT_METRICS = {
@@ -72,13 +76,31 @@ ENVIRONMENT_METRICS = {
             "test/fde": "fde",
             "test/min_fde_5": None,
             "test/min_fde_20": "min_fde\n_20",
+            "test/min_fde_20_agent": None,
             "test/miss_rate_20": None,
+            "test/collisions": None,
             "test/coverage": "coverage",
             "test/mse_last": "mse at\nthe end",
             "test_constant_velocity/fde": "const.\nvelocity",
             "test_constant_velocity/mse_last": None,
+            "test_copy_last/fde": None,
+            "test_copy_last/mse_last": None,
             "test/diverged": None,
         },
+        beside={
+            "constant velocity": "test_constant_velocity",
+            "copy last": "test_copy_last",
+            "true futures": "test_expert",
+        },
+        spare=(
+            "test/min_fde_5",
+            "test/mse_last",
+            "test/diverged",
+            "test/miss_rate_20",
+            "test/coverage",
+            "test/min_fde_20_agent",
+            "test/ade",
+        ),
     ),
 }
 

@@ -158,6 +158,9 @@ def compare(
     each seed's newest run; for a run without the metric, its state. test/on_path, test/path_rms and test/turn_* of runs
     stored before there were such metrics are computed from the rollouts stored of them. --sort by a metric takes the
     mean of each spec. As latex or markdown, prints a table of the specs with mean and standard deviation.
+
+    Errors on different data cannot be compared, so each data set has tables of its own; those of your own trajectories
+    have rows for constant velocity and for copies of the last state.
     """
     from ssmail.store.conditions import specs_in_order
 
@@ -170,19 +173,19 @@ def compare(
         runs = specs_in_order(store, runs, name, descending)
     specs = _limited(list(dict.fromkeys(run.spec_hash for run in runs)), limit, first=name is not None)
     runs = [run for run in runs if run.spec_hash in specs]
-    found = comparison_tables.compared(store, runs, metrics)
+    kind = chosen_format(as_json, form)
+    found = comparison_tables.compared(store, runs, metrics, beside=kind not in (Format.CSV, Format.JSON))
     for metric in metrics or ():
         if runs and not any(item.known for item in found if item.metric == metric):
             raise InputError(
                 f"no run compared here has a metric '{metric}'; `ssmail runs show RUN` lists those it has."
             )
     note(*dict.fromkeys(item.computed for item in found if item.computed))
-    kind = chosen_format(as_json, form)
     if kind is Format.TABLE:
-        comparison_tables.print_comparisons(found)
+        comparison_tables.print_comparisons(found, metrics)
         return
     if kind.of_document:
-        comparison_tables.print_overviews(found, kind)
+        comparison_tables.print_overviews(found, metrics, kind)
         return
     seeds = sorted({seed for item in found for seed in item.values})
     print_rows([comparison_tables.comparison_row(item, seeds, kind) for item in found], {}, kind)

@@ -1,6 +1,7 @@
 """`ssmail plot forecast`, `trajectories` and `film` of forecasts, and what `plot all` and `report` make of own data."""
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -13,14 +14,28 @@ from tests.paper.handmade_arrays import arrays, forecasts, windows
 FDE = {("ssail", 0): 1.0, ("ssail", 1): 3.0, ("dnri", 0): 4.0}
 
 
-def add(store: Store, method: str, seed: int, environment: str = "trajectories", path: str = "flock.npz") -> str:
-    """A finished run of profile smoke; on trajectories with a final displacement error of FDE."""
+def add(
+    store: Store,
+    method: str,
+    seed: int,
+    environment: str = "trajectories",
+    path: str = "flock.npz",
+    contents: str = "",
+    overrides: Sequence[str] = (),
+    final: Mapping[str, float] | None = None,
+) -> str:
+    """A finished run of profile smoke; on trajectories with a final displacement error of FDE.
+
+    contents: of the file, if they are not the usual ones of this path. final: instead of these metrics.
+    """
     own = environment == "trajectories"
-    spec = build_spec(method, environment, "smoke", [f"data.path={path}"] if own else [])
-    writer = store.start_run(spec, seed, dataset_hash=path.encode().hex().ljust(64, "0"), device="cpu")
+    spec = build_spec(method, environment, "smoke", [*([f"data.path={path}"] if own else []), *overrides])
+    dataset_hash = (contents or path).encode().hex().ljust(64, "0")
+    writer = store.start_run(spec, seed, dataset_hash=dataset_hash, device="cpu", repeat=bool(contents))
     writer.epoch(1, {"validation/energy": 0.1} if own else {"train/mode_mse": 0.1})
     writer.arrays({**forecasts(0.001), **windows()} if own else arrays())
-    writer.final(1, {"test/fde": FDE[method, seed], "test_constant_velocity/fde": 9.0} if own else {})
+    usual = {"test/fde": FDE[method, seed], "test_constant_velocity/fde": 9.0} if own and final is None else {}
+    writer.final(1, usual if final is None else final)
     writer.finish(RunState.FINISHED)
     return writer.run_id
 
@@ -153,3 +168,127 @@ def test_runs_compare_shows_what_counts_in_forecasts(cli: CommandLine, store: St
     ours = {row["metric"]: row for row in rows if row["method"] == "ssail" and row["runs"] == "2"}
     assert {"test/fde", "test/min_fde_20", "test/coverage", "test_constant_velocity/fde"} <= ours.keys()
     assert float(ours["test/fde"]["mean"]) == 2.0
+
+
+def beside(fde: float, **changed: float) -> dict[str, float]:
+    """What a run stores: its own errors, those of the baselines, and the collisions of the true futures."""
+    own = dict.fromkeys(("ade", "fde", "min_fde_5", "min_fde_20", "mse_last"), fde)
+    own |= {"min_fde_20_agent": fde / 2, "miss_rate_20": 0.5, "collisions": 0.25, "coverage": 0.75, "diverged": 0.0}
+    still = {"test_constant_velocity": dict.fromkeys(own, 9.0), "test_copy_last": dict.fromkeys(own, 12.0)}
+    values = {"test": own, **still, "test_expert": {"collisions": 0.125}}
+    return {f"{prefix}/{name}": value for prefix, each in values.items() for name, value in each.items()} | changed
+
+
+def documented(cli: CommandLine, store: Store, *options: str) -> list[str]:
+    return cli("runs", "compare", "--format", "markdown", "--db", store.where, *options).out.splitlines()
+
+
+def test_every_data_set_has_a_table_of_its_own(cli: CommandLine, store: Store) -> None:
+    """Their errors cannot be compared; in CSV and JSON a column says which it is."""
+    ssail, dnri = (build_spec(method, "trajectories", "smoke", ["data.path=flock.npz"]) for method in ("ssail", "dnri"))
+    crossing = build_spec("ssail", "trajectories", "smoke", ["data.path=crossing.npz"])
+    assert documented(cli, store) == [
+        "flock (trajectories)",
+        "",
+        "| spec | seeds | test/fde |",
+        "| --- | --- | --- |",
+        f"| ssail {ssail.hash()[:8]} | 2/2 | 2 ± 1.4 |",
+        f"| dnri {dnri.hash()[:8]} | 1/1 | 4 |",
+        "| constant velocity | - | 9 |",
+        "",
+        "crossing (trajectories)",
+        "",
+        "| spec | seeds | test/fde |",
+        "| --- | --- | --- |",
+        f"| ssail {crossing.hash()[:8]} | 1/1 | 1 |",
+        "| constant velocity | - | 9 |",
+    ]
+    latex = cli("runs", "compare", "--format", "latex", "--db", store.where).out.splitlines()
+    assert [line for line in latex if line.startswith("%")] == ["% flock (trajectories)", "% crossing (trajectories)"]
+    assert latex.count(r"\begin{tabular}{lll}") == 2
+    rows = cli("runs", "compare", "--metric", "test/fde", "--db", store.where).rows
+    found = [(row["data_set"], row["method"], float(row["mean"])) for row in rows]
+    assert found == [("flock", "ssail", 2.0), ("flock", "dnri", 4.0), ("crossing", "ssail", 1.0)]
+    items = json.loads(cli("runs", "compare", "--metric", "test/fde", "--json", "--db", store.where).out)
+    assert [(item["data_set"], item["differs"]) for item in items] == [("flock", {}), ("flock", {}), ("crossing", {})]
+    table = cli("runs", "compare", "--format", "table", "--db", store.where).out
+    assert [line.partition(":")[0] for line in table.splitlines() if "mean ±" in line] == [
+        "flock (trajectories)",
+        "crossing (trajectories)",
+    ]
+    assert "dnri on flock (trajectories), profile smoke" in table
+
+
+def test_a_file_that_was_written_anew_is_another_data_set(cli: CommandLine, store: Store) -> None:
+    add(store, "ssail", 0, contents="other", final={"test/fde": 100.0})
+    rows = cli("runs", "compare", "--metric", "test/fde", "--method", "ssail", "--db", store.where).rows
+    found = {row["data_set"]: float(row["mean"]) for row in rows}
+    assert found == {"flock-666c6f63": 2.0, "crossing": 1.0, "flock-6f746865": 100.0}
+
+
+def test_generated_data_has_no_name(cli: CommandLine, store: Store) -> None:
+    add(store, "ssail", 0, "yjunction", final={"test/mode_mse": 0.1})
+    (row,) = cli("runs", "compare", "--env", "yjunction", "--metric", "test/mode_mse", "--db", store.where).rows
+    assert (row["environment"], row["data_set"]) == ("yjunction", "")
+    lines = documented(cli, store, "--metric", "test/mode_mse", "--env", "yjunction")
+    assert lines[0] == "| spec | seeds | test/mode\\_mse |"
+    assert "yjunction" in documented(cli, store)
+
+
+def test_baselines_and_true_futures_stand_beside_the_methods(cli: CommandLine, store: Store) -> None:
+    for method, fde in (("dnri", 4.0), ("ssail", 2.0)):
+        add(store, method, 3, path="town.npz", final=beside(fde))
+    lines = documented(cli, store, "--where", "seed=3")
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    shown = [dict(zip(cells[0], row, strict=True)) for row in cells[2:]]
+    fde = {row["spec"].rpartition(" ")[0] if "-" not in row["seeds"] else row["spec"]: row["test/fde"] for row in shown}
+    assert fde == {"dnri": "4", "ssail": "2", "constant velocity": "9", "copy last": "12", "true futures": "-"}
+    assert [row["test/collisions"] for row in shown] == ["0.25", "0.25", "9", "12", "0.125"]
+    assert [row["test/min\\_fde\\_20\\_agent"] for row in shown] == ["2", "1", "9", "12", "-"]
+    assert not any("constant" in heading for heading in cells[0])
+    only = documented(cli, store, "--where", "seed=3", "--metric", "test_constant_velocity/fde")
+    assert only[2] == "| spec | seeds | test\\_constant\\_velocity/fde |"
+
+
+def test_a_baseline_has_one_row_unless_it_was_tested_otherwise(cli: CommandLine, store: Store) -> None:
+    """A method that is the baseline itself is enough; values of another test are those of its spec."""
+    options = ("--where", "seed=3", "--metric", "test/fde")
+    add(store, "constant-velocity", 3, path="town.npz", final=beside(9.0))
+    add(store, "dnri", 3, path="town.npz", final={"test/fde": 2.0, "test_constant_velocity/fde": 9.00001})
+    names = [line.split("|")[1].strip() for line in documented(cli, store, *options)[4:]]
+    assert [name.rpartition(" ")[0] for name in names] == ["constant-velocity", "dnri", "copy"]
+    for frames, error in ((3, 11.0), (4, 8.0)):
+        final = {"test/fde": 3.0, "test_constant_velocity/fde": error}
+        add(store, "dnri", 3, path="town.npz", overrides=[f"forecast.observed={frames}"], final=final)
+        if frames == 3:
+            assert documented(cli, store, *options)[-2] == "| constant velocity | - | 11 |"
+    assert documented(cli, store, *options)[-3:-1] == [
+        "| constant velocity, as tested with dnri observed 3 | - | 11 |",
+        "| constant velocity, as tested with dnri observed 4 | - | 8 |",
+    ]
+
+
+def test_single_agents_have_a_column_where_it_says_something_else(cli: CommandLine, store: Store) -> None:
+    same = {"test/min_fde_20_agent": 4.0}
+    add(store, "dnri", 3, path="town.npz", final=beside(4.0, **same))
+    assert not any("agent" in line for line in documented(cli, store, "--where", "seed=3"))
+    add(store, "ssail", 3, path="town.npz", final=beside(4.0))
+    assert any("agent" in line for line in documented(cli, store, "--where", "seed=3"))
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_a_table_of_forecasts_is_as_wide_as_the_terminal(
+    cli: CommandLine, store: Store, monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    for method in ("dnri", "ssail", "gail"):
+        for seed in (3, 4, 5):
+            add(store, method, seed, path="town.npz", final=beside(1234.5678 / seed))
+    monkeypatch.setenv("COLUMNS", str(columns))
+    table = cli("runs", "compare", "--format", "table", "--where", "seed>2", "--db", store.where).out
+    lines = [line for line in table.splitlines() if "(trajectories)" not in line]
+    assert max(map(len, lines)) <= columns
+    overview = table[table.index("mean ±") :]
+    for word in ("fde", "min_fde", "_agent", "collisions"):
+        assert word in overview
+    assert next(line for line in overview.splitlines() if line.startswith("gail")).split()[2:4] == ["3/3", "322"]
+    assert ("left out, as the terminal is narrow: test/min_fde_5" in overview) == (columns == 80)

@@ -117,3 +117,24 @@ def test_a_password_is_not_printed(capsys: pytest.CaptureFixture[str]) -> None:
     output.note("postgresql://u:SECRET@h/d")
     output.complain("postgresql://u:SECRET@h/d cannot be opened")
     assert "SECRET" not in "".join(capsys.readouterr())
+
+
+def test_a_table_that_is_too_wide_is_folded_before_columns_are_left_out(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "26")
+    rows = [{"spec": "ssail", "a": "1.23 ± 0.45", "b": "6.78 ± 0.9"}, {"spec": "bc", "a": "1.2", "b": None}]
+    columns = {"spec": "spec", "a": "test/\nmin_fde\n_20", "b": "test/\nfde"}
+    output.print_table(rows, columns, ("a",), fold=True)
+    assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == [
+        "      test/",
+        "      min_fde test/",
+        "spec  _20     fde",
+        "ssail 1.23    6.78",
+        "      ± 0.45  ± 0.9",
+        "bc    1.2     -",
+    ]
+    output.print_table(rows, columns, ("a",))
+    told = capsys.readouterr().out.splitlines()
+    assert told[-3].split() == ["bc", "-"]
+    assert " ".join(told[-2:]) == "left out, as the terminal is narrow: test/min_fde_20"

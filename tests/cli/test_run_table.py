@@ -22,7 +22,8 @@ def test_what_is_shown_is_recorded(environment: str, tmp_path: Path) -> None:
         overrides = [f"data.path={windows}", "forecast.predicted=40"]
     if environment == "trajectories":
         expert_sets.save(flocks.generate([2, 3], scenes=8), tmp_path / "flock.npz")
-        overrides = [f"data.path={tmp_path / 'flock.npz'}", "evaluation.samples=20"]
+        measured = ["evaluation.samples=20", "forecast.collision_distance=1"]
+        overrides = [f"data.path={tmp_path / 'flock.npz'}", *measured]
     loop = TrainingLoop(build_spec("constant-velocity", environment, "smoke", overrides), 0)
     shown = ENVIRONMENT_METRICS[environment]
     assert {shown.validation, shown.curve} <= loop.evaluator.epoch(loop.learner.predictor).keys()
@@ -30,6 +31,9 @@ def test_what_is_shown_is_recorded(environment: str, tmp_path: Path) -> None:
     final, _ = loop.final_evaluation()
     assert shown.error in shown.compared
     assert shown.compared.keys() <= final.keys()
+    assert set(shown.spare) <= shown.compared.keys()
+    for prefix in shown.beside.values():
+        assert any(name.startswith(f"{prefix}/") for name in final)
 
 
 def test_metrics_that_environments_share_come_once() -> None:

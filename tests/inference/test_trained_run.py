@@ -111,6 +111,15 @@ def test_what_cannot_be_predicted_is_one_sentence(train: Train) -> None:
     assert run.rollout(WALK, 47).shape[2] == 47
 
 
+@pytest.mark.parametrize("value", [2.5, 2.0, "2", None, np.ones(2), 2**70])
+@pytest.mark.parametrize("name", ["steps", "samples", "seed"])
+def test_counts_that_are_no_whole_numbers_are_one_sentence(train: Train, name: str, value: Any) -> None:
+    run = load_run(train("ssail").id, train("ssail").db)
+    with pytest.raises(InputError, match=f"^{name} is a whole number"):
+        run.rollout(WALK, **{"steps": 3, name: value})
+    assert run.rollout(WALK, **{"steps": 3, name: np.int64(2)}).ndim == 5
+
+
 def test_the_last_model_is_another_one(train: Train) -> None:
     trained = train("ssail")
     last = load_run(trained.id, trained.db, model="last")

@@ -3,7 +3,7 @@
 import pytest
 
 from ssmail.errors import InputError
-from ssmail.plots.data_sets import DataSet, data_sets, is_own, required
+from ssmail.plots.data_sets import DataSet, by_data, data_sets, is_own, required
 from ssmail.store import RunState, Store
 
 from .conftest import AddRun
@@ -23,6 +23,26 @@ def test_runs_on_different_data_are_apart(
     again = add_trajectories(path="elsewhere/flock.npz", dataset_hash="f" * 64)
     found = {each.name: [run.id for run in each.runs] for each in data_sets(store, store.runs())}
     assert found == {"flock-eeeeeeee": [flock], "mocap": [mocap], "flock-ffffffff": [again]}
+
+
+def test_runs_in_any_state_are_compared_with_those_on_the_same_data(
+    store: Store, add_run: AddRun, add_forecast: AddRun, add_trajectories: AddRun
+) -> None:
+    """A run that has not read its file yet belongs to that file; generated data has no name."""
+    lanes = [add_run(), add_run(1)]
+    flock, town = add_trajectories(path="flock.npz"), add_trajectories(path="town.npz", dataset_hash="f" * 64)
+    waiting = add_trajectories(1, path="town.npz", dataset_hash=None, state=RunState.INTERRUPTED)
+    copied = add_trajectories(1, path="copy-of/flock.npz")
+    unread = add_trajectories(path="other/town.npz", dataset_hash=None, state=RunState.FAILED)
+    mocap = add_forecast()
+    found = [(name, [run.id for run in each]) for name, each in by_data(store.runs())]
+    assert found == [
+        (None, lanes),
+        ("flock", [flock, copied]),
+        ("town-ffffffff", [town, waiting]),
+        ("town-none", [unread]),
+        ("mocap", [mocap]),
+    ]
 
 
 def test_runs_without_errors_make_no_data_set(store: Store, add_trajectories: AddRun) -> None:

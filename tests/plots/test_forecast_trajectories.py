@@ -1,10 +1,13 @@
 """`ssmail plot trajectories` and the film of a forecast: what is drawn is what is stored."""
 
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.text import Text
 from PIL import Image
 
 from ssmail.errors import InputError, stored_values
@@ -26,6 +29,82 @@ def segments(axes: Any) -> dict[str, np.ndarray]:
             lines = collection._segments3d if axes.name == "3d" else collection.get_segments()
             found[collection.get_gid().split("-")[0]] = np.array(lines)
     return found
+
+
+def placed(*indices: int) -> dict[str, np.ndarray]:
+    """What a run stores of where its windows are: window i is in scene s, si or sii, from frame 10 i on."""
+    scenes = np.array([f"s{'i' * n}ü\n".encode() for n in range(len(indices))])
+    places = {"test/window": np.array(indices), "test/frame": 10 * np.array(indices)}
+    return {**places, "test/scene": scenes.view(np.uint8).reshape(len(indices), -1)}
+
+
+def test_a_window_goes_by_its_index_in_the_test_split(
+    store: Store, add_trajectories: AddRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 60 test windows, six are stored; the second of three kept here is test window 12."""
+    run = add_trajectories(extra=placed(0, 12, 24))
+    record = collect(store, run, [24, 12])
+    assert record.stem == f"trajectories_{run[:8]}_24-12"
+    assert record.provenance.options == {"windows": [24, 12]}
+    titles = [panel.get_title() for panel in draw(record).axes]
+    assert titles == [
+        "test window 24 (1 agent)\nscene siiü\\n, frame 240",
+        "test window 12 (2 agents)\nscene siü\\n, frame 120",
+    ]
+    table = record.table()
+    assert [*table.columns] == ["window", "scene", "start", "kind", "sample", "agent", "step", "x", "y"]
+    assert {*zip(table["window"], table["scene"], table["start"], strict=True)} == {
+        (24, "siiü\\n", 240),
+        (12, "siü\\n", 120),
+    }
+    np.testing.assert_allclose(table[table["window"] == 12]["x"].min(), 10 - OBSERVED + 1)  # the second stored one
+    reason = rf"stored the test windows 0, 12, 24, but no window 2; `ssmail forecast {run[:8]} DATA` forecasts any"
+    for collected in (lambda: collect(store, run, [2]), lambda: forecast_film.collect(store, run, 2)):
+        with pytest.raises(InputError, match=reason):
+            collected()
+    titled: list[str] = []
+    monkeypatch.setattr(Axes, "set_title", lambda axes, label, **_: titled.append(label))
+    forecast_film.save_film(forecast_film.collect(store, run, 24), tmp_path)
+    assert titled[-1] == "test window 24, predicted step 5 of 5\nscene siiü\\n, frame 240"
+
+
+@pytest.mark.parametrize(
+    ("count", "overrides", "known"),
+    [
+        (3, [], True),
+        (3, ["evaluation.test_windows=4"], True),
+        (3, ["evaluation.test_windows=3"], False),
+        (6, [], False),
+    ],
+)
+def test_an_earlier_run_numbers_its_windows_and_says_so(
+    store: Store, add_trajectories: AddRun, count: int, overrides: list[str], known: bool
+) -> None:
+    """Six windows evenly over the tested ones were kept, so fewer are all of them: if all of the split were tested."""
+    axis = {"test/samples": 1}
+    arrays = {name: np.concatenate([values] * (count // 3), axis.get(name, 0)) for name, values in windows().items()}
+    run = add_trajectories(extra=arrays, overrides=overrides)
+    record = collect(store, run, [2])
+    name = "test window 2" if known else "stored window 2"
+    assert draw(record).axes[0].get_title() == f"{name} (1 agent)"
+    assert [*record.table().columns][:2] == ["window", "kind"]
+    assert ("does not say where in the test split its windows are" in " ".join(record.notes)) is not known
+    reason = "the test windows 0-2" if known else f"{count} windows, numbered 0-{count - 1}"
+    with pytest.raises(InputError, match=f"stored {reason}, but no window 30"):
+        collect(store, run, [30])
+
+
+@pytest.mark.parametrize("axes", [1, 2, 3])
+def test_no_text_is_written_over_another(store: Store, add_trajectories: AddRun, axes: int) -> None:
+    """Windows that are much wider than high make low panels."""
+    figure = draw(collect(store, add_trajectories(axes=axes, extra=placed(0, 12, 24))))
+    figure.draw_without_rendering()
+    visible = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+    boxes = [(text.get_text(), text.get_window_extent()) for text in visible]
+    assert any("units" in text for text, _ in boxes) == (axes < 3)
+    for (text, box), (other, beyond) in combinations(boxes, 2):
+        if max(len(text), len(other)) > 4:  # not between ticks
+            assert not box.overlaps(beyond), f"{text!r} over {other!r}"
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3])
@@ -81,7 +160,7 @@ def test_samples_widen_a_picture_only_so_far(store: Store, add_trajectories: Add
     arrays["test/samples"][0, 0, 2, 0, 1] = 1e30
     arrays["test/samples"][1, 0, 3, 0, 0] = np.nan
     far = collect(store, add_trajectories(extra=arrays))
-    assert far.notes[1] == "window 0: 2 samples leaving the picture."
+    assert far.notes[1] == "test window 0: 2 samples leaving the picture."
     low, high = far.windows[0].limits()
     np.testing.assert_allclose(low, [-3.6, -0.6], atol=1e-5)
     np.testing.assert_allclose(high, [7.6, 7.6], atol=1e-5)
@@ -91,7 +170,7 @@ def test_samples_widen_a_picture_only_so_far(store: Store, add_trajectories: Add
 def test_windows_and_runs_that_are_not_there(
     store: Store, add_run: AddRun, add_forecast: AddRun, add_trajectories: AddRun
 ) -> None:
-    with pytest.raises(InputError, match="stored the windows 0-2, but no window 3"):
+    with pytest.raises(InputError, match="stored the test windows 0-2, but no window 3"):
         collect(store, add_trajectories(), [3])
     for run, reason in (
         (add_run(), r"ssail on yjunction, finished\) stored no forecasts of test windows"),
@@ -113,10 +192,16 @@ def test_windows_and_runs_that_are_not_there(
         ("test/agents", lambda values: values + 1),
         ("test/agents", lambda values: values - 2),
         ("test/agents", lambda values: values[:1]),
+        ("test/window", lambda values: values[:1]),
+        ("test/window", lambda values: values * 0),
+        ("test/window", lambda values: values + 0.5),
+        ("test/scene", lambda values: values[:1]),
+        ("test/scene", lambda values: values.astype(float)),
+        ("test/frame", lambda values: values[:1]),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(store: Store, add_trajectories: AddRun, name: str, change: Any) -> None:
-    arrays = windows()
+    arrays = {**windows(), **placed(0, 12, 24)}
     arrays[name] = change(arrays[name])
     run = add_trajectories(extra=arrays)
     with pytest.raises(InputError, match="what is stored of it does not fit together"), stored_values("it"):

@@ -104,6 +104,7 @@ def test_the_test_may_be_bounded_to_windows_evenly_over_the_split(make: Make) ->
     (values, arrays), (all_values, _) = (loop.final_evaluation() for loop in (bounded, whole))
     assert values["test/fde"] != pytest.approx(all_values["test/fde"])
     np.testing.assert_allclose(arrays["test/future"], test.positions[chosen, 4:], rtol=1e-6)
+    np.testing.assert_array_equal(arrays["test/window"], chosen)
 
 
 def test_the_kept_windows_are_those_of_the_set(make: Make) -> None:
@@ -113,7 +114,14 @@ def test_the_kept_windows_are_those_of_the_set(make: Make) -> None:
     test = loop.data.test
     kept = np.linspace(0, len(test) - 1, 6).round().astype(int)
     assert test.agents is not None
+    assert test.scene is not None
+    assert test.frame is not None
     np.testing.assert_array_equal(arrays["test/agents"], test.agents[kept])
+    np.testing.assert_array_equal(arrays["test/window"], kept)
+    np.testing.assert_array_equal(arrays["test/frame"], test.frame[kept])
+    scenes = [bytes(name).rstrip(b"\0").decode() for name in arrays["test/scene"]]
+    assert scenes == [loop.data.scenes[scene] for scene in test.scene[kept]]
+    assert len({*scenes}) > 1
     np.testing.assert_allclose(arrays["test/observed"], test.positions[kept, :4], rtol=1e-6)
     np.testing.assert_allclose(arrays["test/future"], test.positions[kept, 4:], rtol=1e-6)
     samples = arrays["test/samples"]

@@ -1,6 +1,7 @@
 """The trained model of a stored run, in the units of its data: `load_run` returns a `TrainedRun`."""
 
 import json
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -93,9 +94,11 @@ class TrainedRun:
         `samples`, in the same units. All agents of a sample are sampled jointly. The same arguments yield the same
         numbers on the same machine. A baseline's samples are all alike.
 
-        Raises InputError if the array has another shape or is not finite, if the model cannot read so many agents, or
-        if it reads the step index and these are more steps than it was trained on.
+        Raises InputError if the array has another shape or is not finite, if the model cannot read so many agents, if
+        it reads the step index and these are more steps than it was trained on, or if steps, samples and seed are not
+        whole numbers.
         """
+        steps, samples, seed = _whole("steps", steps), _whole("samples", samples), _whole("seed", seed)
         positions = _numbers(observed)
         if positions.ndim not in (3, 4):
             raise InputError(f"the observed positions need axes (T, N, P) or (B, T, N, P), not {positions.ndim} axes.")
@@ -266,6 +269,17 @@ def _epoch(checkpoint: Any) -> int:
 
 def _unfit(row: RunRow, error: UnfitState) -> InputError:
     return InputError(f"the checkpoint of run {row.name} does not fit its run ({error}); train it again")
+
+
+def _whole(name: str, value: Any) -> int:
+    """Return an argument of `rollout` as an int. Raises InputError unless it is a whole number of a usable size."""
+    try:
+        number = operator.index(value)
+    except TypeError:
+        raise InputError(f"{name} is a whole number, not {value!r:.40}.") from None
+    if not -(2**63) <= number < 2**63:
+        raise InputError(f"{name} is a whole number of at most 64 bits, not {number}; give a smaller one.")
+    return number
 
 
 def _numbers(observed: npt.ArrayLike) -> Floats:

@@ -1,12 +1,13 @@
 """Runs that forecast, by the data that they were trained on: recorded motion, or trajectories of the user's own.
 
-Errors on different data are not comparable, so each data set has figures of its own. Of a data set, one profile is
-drawn, that with the most seeds, and of each method the spec with the most seeds, the newest on a tie. Of each seed it
+Errors on different data are not comparable, so each data set has figures and tables of its own. A figure draws one
+profile, that with the most seeds, and of each method the spec with the most seeds, the newest on a tie. Of each seed it
 is the newest run that finished or diverged. Baselines are drawn as references by all figures, so runs of theirs are
 left out. Explicit run ids replace this choice: then each spec is a group of its own.
 """
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,11 +83,35 @@ def data_sets(store: Store, runs: Sequence[RunRow]) -> list[DataSet]:
         if run.environment in ENVIRONMENTS and run.state.settled and _has_errors(store, run):
             found.setdefault((run.environment, run.dataset_hash), []).append(run)
     drawable = {key: each for key, each in found.items() if any(run.state is RunState.FINISHED for run in each)}
-    names = [name_of(each[-1]) for each in drawable.values()]
-    return [
-        DataSet(name if names.count(name) == 1 else f"{name}-{(digest or 'none')[:8]}", environment, tuple(each))
-        for name, ((environment, digest), each) in zip(names, drawable.items(), strict=True)
-    ]
+    names = _names(drawable)
+    return [DataSet(names[key], key[0], tuple(each)) for key, each in drawable.items()]
+
+
+def by_data(runs: Sequence[RunRow]) -> list[tuple[str | None, list[RunRow]]]:
+    """Return the runs whose results can be compared together, with the name of their data set.
+
+    On ENVIRONMENTS these are the runs on one data set; a run that did not come to read its file counts as one on the
+    same file. The data of other environments are generated, so all runs of one are together, under no name.
+    """
+    read = {(run.environment, _path(run)): run.dataset_hash for run in runs if run.dataset_hash}
+    named: dict[tuple[str, str | None], list[RunRow]] = {}
+    found: dict[tuple[str, str | None], list[RunRow]] = {}
+    for run in runs:
+        recorded = run.environment in ENVIRONMENTS
+        digest = run.dataset_hash or read.get((run.environment, _path(run))) if recorded else None
+        group = found.setdefault((run.environment, digest), [])
+        group.append(run)
+        if recorded:
+            named[run.environment, digest] = group
+    names = _names(named)
+    return [(names.get(key), each) for key, each in found.items()]
+
+
+def _names(sets: Mapping[tuple[str, str | None], Sequence[RunRow]]) -> dict[tuple[str, str | None], str]:
+    """Return a name for each data set, given as its environment and hash, by the last of its runs."""
+    names = {key: name_of(each[-1]) for key, each in sets.items()}
+    shared = [name for name, times in Counter(names.values()).items() if times > 1]
+    return {key: f"{name}-{(key[1] or 'none')[:8]}" if name in shared else name for key, name in names.items()}
 
 
 def required(store: Store, figure: str, runs: Sequence[RunRow]) -> list[DataSet]:

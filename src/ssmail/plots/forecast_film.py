@@ -66,7 +66,7 @@ def _film(record: TrajectoriesRecord) -> Iterator[Image.Image]:
             artist.remove()
         forecast_windows.draw_window(axes, window, until=step)
         where = f"predicted step {step} of {len(window.future)}" if step > 0 else f"observed step {step}"
-        axes.set_title(f"window {window.index}, {where}", fontsize=7, pad=2)
+        axes.set_title(window.title(f", {where}"), fontsize=7, pad=2)
         picture = io.BytesIO()
         figure.savefig(picture, format="png", dpi=RESOLUTION, pil_kwargs={"compress_level": 1})
         yield Image.open(picture).convert("RGB")

@@ -52,7 +52,10 @@ class TrajectoriesRecord:
         )
 
     def table(self) -> pd.DataFrame:
-        """[window, kind, sample, agent, step, x, ...]; kind: observed, true, sampled (others have sample -1)."""
+        """[window, kind, sample, agent, step, x, ...]; kind: observed, true, sampled (others have sample -1).
+
+        Where the run stored them, scene and start (its first frame) stand beside the window.
+        """
         return pd.concat([rows for window in self.windows for rows in window.rows()], ignore_index=True)
 
 
@@ -80,23 +83,24 @@ def draw(record: TrajectoriesRecord) -> Figure:
     columns = 1 if axes == 1 or len(windows) == 1 else 2
     rows = -(-len(windows) // columns)
     ratio = forecast_windows.ratio(windows)
-    tall = {1: 0.85 if rows > 1 else 1.6, 2: ratio * 2.6 / columns + 0.3, 3: 3.0 / columns + 0.2}[axes]
+    tall = {1: 0.85 if rows > 1 else 1.6, 2: ratio * 2.6 / columns + 0.4, 3: 3.0 / columns + 0.2}[axes]
+    tall += 0.0 if windows[0].scene is None else 0.12  # a second line of the titles
     with style.sheet():
         figure = style.new_figure(height=0.75 + rows * tall)
         for place, window in enumerate(windows):
             panel = forecast_windows.panel(figure, (rows, columns, place + 1), axes, record.run.environment)
             forecast_windows.frame(panel, window, ratio)
             forecast_windows.draw_window(panel, window)
-            panel.set_title(f"window {window.index} ({counted(window.future.shape[1], 'agent')})", fontsize=7, pad=2)
-            _label(panel, record, left=place % columns == 0, bottom=place + columns >= len(windows))
-        if axes == 1:
-            figure.supylabel(axis_label("x", record.run.environment), fontsize=7)
+            panel.set_title(window.title(f" ({counted(window.future.shape[1], 'agent')})"), fontsize=7, pad=2)
+            _label(panel, record, bottom=place + columns >= len(windows))
+        if axes < 3:  # one label for all rows, which may be less high than it is long
+            figure.supylabel(axis_label("x" if axes == 1 else "y", record.run.environment), fontsize=7)
         forecast_windows.legend(figure, windows, record.title)
         return figure
 
 
-def _label(panel: Axes, record: TrajectoriesRecord, left: bool, bottom: bool) -> None:
-    """Label the axes of a panel in the plane at the edges of the figure, and all axes in space."""
+def _label(panel: Axes, record: TrajectoriesRecord, bottom: bool) -> None:
+    """Label the horizontal axis of a panel in the plane at the bottom of the figure, and all axes in space."""
     environment = record.run.environment
     if panel.name == "3d":
         for name in AXES:
@@ -108,5 +112,3 @@ def _label(panel: Axes, record: TrajectoriesRecord, left: bool, bottom: bool) ->
         panel.tick_params(labelbottom=bottom)
     if bottom:
         panel.set_xlabel("step" if one else axis_label("x", environment), fontsize=7)
-    if left and not one:
-        panel.set_ylabel(axis_label("y", environment), fontsize=7)

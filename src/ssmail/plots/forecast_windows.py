@@ -3,6 +3,9 @@
 Positions are in the units of the data. A window shows its observed steps, ..., -1, 0, the true future 1, 2, ..., and
 the sampled futures. One-dimensional positions are drawn over the step; in two and three dimensions all axes of a window
 have one scale. Observed steps are missing where a run stored none, as on recorded motion.
+
+A window goes by its index in the test split, as in `ssmail forecast`. Earlier runs on trajectories of the user's own
+did not store it. They kept six windows evenly over the tested ones, so it is known only where there were fewer.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,7 +22,7 @@ from matplotlib.ticker import MaxNLocator
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
 from ssmail.data.trajectories import Floats, Integers
-from ssmail.errors import InputError, command_line
+from ssmail.errors import InputError, command_line, printable, shortened
 from ssmail.plots import style
 from ssmail.plots.data_sets import name_of
 from ssmail.plots.formatting import counted, spans
@@ -33,16 +36,33 @@ MOST_SAMPLES = 50  # of a window
 BEYOND = 0.5  # of a window's extent: how far from the truth its picture may reach
 MARGIN = 0.06
 CROWD = 8  # agents; lines of more are thinner
+ONCE_KEPT = 6  # windows of a run on trajectories, when their indices were not stored
+LONGEST_SCENE = 15  # characters in a title
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
     """One test window. Positions are in raw units."""
 
-    index: int  # among those that the run stored
+    index: int  # in the test split; where that is not known, among those that the run stored
+    is_indexed: bool  # whether it is that in the test split
+    scene: str | None  # the name of its scene, where stored
+    frame: int | None  # its first frame in the scene, where stored
     observed: Floats  # (H, N, P); H = 0 where none is stored
     future: Floats  # (T, N, P)
     samples: Floats  # (S, T, N, P)
+
+    @property
+    def name(self) -> str:
+        """ "test window 24"; "stored window 2" where its index in the test split is not known."""
+        return f"{'test' if self.is_indexed else 'stored'} window {self.index}"
+
+    def title(self, about: str) -> str:
+        """The name and what is said about it, and in a second line the scene and first frame, where known."""
+        if self.scene is None:
+            return f"{self.name}{about}"
+        scene = style.literal(shortened(self.scene, LONGEST_SCENE))
+        return f"{self.name}{about}\nscene {scene}, frame {self.frame}"
 
     @property
     def axes(self) -> int:
@@ -98,7 +118,11 @@ class Window:
         return int((~inside).sum())
 
     def rows(self) -> Iterator[pd.DataFrame]:
-        """Yield [window, kind, sample, agent, step, x, ...] of observed, true and sampled positions."""
+        """Yield [window, kind, sample, agent, step, x, ...] of observed, true and sampled positions.
+
+        Where known, there are the scene and the first frame (start) of the window, too.
+        """
+        where = {} if self.scene is None else {"scene": self.scene, "start": self.frame}
         for kind, positions, first in (
             ("observed", self.observed[None], self.first_step),
             ("true", self.future[None], 1),
@@ -108,7 +132,8 @@ class Window:
             columns = dict(zip(AXES, positions.reshape(-1, self.axes).T, strict=False))
             numbers = sample if kind == "sampled" else np.full_like(sample, -1)
             yield pd.DataFrame(
-                {"window": self.index, "kind": kind, "sample": numbers, "agent": agent, "step": first + step, **columns}
+                {"window": self.index, **where, "kind": kind, "sample": numbers, "agent": agent}
+                | {"step": first + step, **columns}
             )
 
 
@@ -120,7 +145,7 @@ def are_stored(store: Store, run: RunRow) -> bool:
 def read(store: Store, run: RunRow, indices: Sequence[int] | None, most: int) -> tuple[tuple[Window, ...], int]:
     """Return the windows of the run with these indices, by default its first `most`, and how many it stored.
 
-    Raises InputError for a run that stored none, and for an index that it does not have.
+    Raises InputError for a run that stored none, and for a window that it did not store.
     """
     names = store.array_names(run.id)
     if "test/samples" in names:
@@ -133,20 +158,56 @@ def read(store: Store, run: RunRow, indices: Sequence[int] | None, most: int) ->
         raise InputError(f"run {run.name} {_lack(run)}")
     _check_shapes(observed, future, samples, agents)
     count = len(future)
-    chosen = list(indices if indices else range(min(most, count)))
-    for index in chosen:
-        if not 0 <= index < count:
-            raise InputError(f"run {run.name} stored the windows {spans(list(range(count)))}, but no window {index}.")
-    there = [slice(None if agents is None else int(agents[index])) for index in range(count)]
+    known, are_indices = _indices(store, run, names, count)
+    scenes = _scenes(store, run, names, count)
+    there = [slice(None if agents is None else int(agents[place])) for place in range(count)]
     return tuple(
         Window(
-            index,
-            observed=observed[index, :, there[index]].astype(np.float64),
-            future=future[index, :, there[index]].astype(np.float64),
-            samples=samples[:MOST_SAMPLES, index, :, there[index]].astype(np.float64),
+            known[place],
+            are_indices,
+            *scenes[place],
+            observed=observed[place, :, there[place]].astype(np.float64),
+            future=future[place, :, there[place]].astype(np.float64),
+            samples=samples[:MOST_SAMPLES, place, :, there[place]].astype(np.float64),
         )
-        for index in dict.fromkeys(chosen)
+        for place in _places(run, known, are_indices, indices or known[:most])
     ), count
+
+
+def _indices(store: Store, run: RunRow, names: Sequence[str], count: int) -> tuple[list[int], bool]:
+    """Return a number for each of the `count` stored windows, and whether it is its index in the test split."""
+    if "test/window" in names:
+        found = store.array(run.id, "test/window")
+        if found.shape != (count,) or found.dtype.kind not in "iu" or len(set(found.tolist())) < count:
+            raise ValueError(f"indices of windows of shape {found.shape} and type {found.dtype}")
+        return found.tolist(), True
+    if "test/samples" not in names:  # recorded motion: the first windows of the split
+        return list(range(count)), True
+    tested = run.spec.get("evaluation", {}).get("test_windows")
+    return list(range(count)), count < ONCE_KEPT and (tested is None or tested > count)
+
+
+def _scenes(store: Store, run: RunRow, names: Sequence[str], count: int) -> list[tuple[str | None, int | None]]:
+    """Return the name of the scene and the first frame of each stored window; None where the run does not say."""
+    if not {"test/scene", "test/frame"} <= {*names}:
+        return [(None, None)] * count
+    scenes, frames = store.array(run.id, "test/scene"), store.array(run.id, "test/frame")
+    if scenes.dtype != np.uint8 or scenes.ndim != 2 or len(scenes) != count or frames.shape != (count,):
+        raise ValueError(f"scenes and frames of shapes {scenes.shape} and {frames.shape}")
+    texts = [printable(bytes(scene).rstrip(b"\0").decode("utf-8", "replace")) for scene in scenes]
+    return [(text, int(frame)) for text, frame in zip(texts, frames, strict=True)]
+
+
+def _places(run: RunRow, known: Sequence[int], are_indices: bool, wanted: Sequence[int]) -> list[int]:
+    """Return the places of the wanted windows among the stored ones, each once. Raises InputError."""
+    for index in wanted:
+        if index not in known:
+            which = "the test windows" if are_indices else f"{counted(len(known), 'window')}, numbered"
+            raise InputError(
+                f"run {run.name} stored {which} {spans(list(known))}, but no window {index}; "
+                f"`{command_line('ssmail', 'forecast', run.name, 'DATA')}` forecasts any window of the test split."
+            )
+    return [known.index(index) for index in dict.fromkeys(wanted)]
 
 
 def _check_shapes(observed: Any, future: Any, samples: Any, agents: Any) -> None:
@@ -175,8 +236,11 @@ def notes(run: RunRow, windows: Sequence[Window], count: int) -> tuple[str, ...]
     samples = counted(len(windows[0].samples), "sample")
     shown = f"{counted(len(windows), 'window')} of {count} stored ones, {samples} of each"
     about = f"run {run.name}: {run.method} on {name_of(run)}, seed {run.seed}, {run.state}; {shown}."
-    outside = [f"window {w.index}: {counted(w.leaving, 'sample')} leaving the picture." for w in windows if w.leaving]
-    return about, *outside
+    outside = [f"{w.name}: {counted(w.leaving, 'sample')} leaving the picture." for w in windows if w.leaving]
+    if windows[0].is_indexed:
+        return about, *outside
+    unknown = f"run {run.name} does not say where in the test split its windows are; they are numbered in this order."
+    return about, unknown, *outside
 
 
 def panel(figure: Figure, place: tuple[int, int, int], axes: int, environment: str) -> Axes:

@@ -22,6 +22,7 @@ class Comparison:
     states: the state of that run by seed. Runs in every state are included, diverged ones too.
     computed: how the values that the runs did not store were computed, in one sentence; None if all were stored.
     changes: the dotted spec keys in which the spec differs from its profile, with its values; settings: both in words.
+    data_set: the name of the data that the runs were trained on, if they come from a file.
     """
 
     method: str
@@ -35,6 +36,7 @@ class Comparison:
     computed: str | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
     settings: str = ""
+    data_set: str | None = None
 
     @property
     def known(self) -> list[float]:
@@ -61,11 +63,13 @@ class Comparison:
         return statistics.median(self.known) if self.known else None
 
 
-def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -> list[Comparison]:
+def compare_runs(
+    store: Store, runs: Sequence[RunRow], metrics: Sequence[str], data_set: str | None = None
+) -> list[Comparison]:
     """Return one Comparison per spec and metric, with specs in the order of their first run.
 
     `runs` must be ordered newest last. Specs of the same method and environment are identified by the keys in which
-    they differ.
+    they differ. data_set: the name of their data, on which all of them were trained.
     """
     newest = {(run.spec_hash, run.seed): run for run in runs}
     specs: dict[str, list[RunRow]] = {}
@@ -87,6 +91,7 @@ def compare_runs(store: Store, runs: Sequence[RunRow], metrics: Sequence[str]) -
             computed=computed,
             changes=found[0].changes,
             settings=found[0].settings,
+            data_set=data_set,
         )
         for spec, found in by_seed.items()
         for metric in metrics

@@ -34,7 +34,8 @@ class TrajectoryEvaluator(Evaluator):
         self.observed, self.predicted = check_frames(self.forecast, data)
         super().__init__(context, data)
         self.validation = data.validation[_evenly(len(data.validation), self.spec.validation_windows)]
-        self.test = data.test[_evenly(len(data.test), self.spec.test_windows)]
+        self.tested = _evenly(len(data.test), self.spec.test_windows)
+        self.test = data.test[self.tested]
 
     def epoch(self, predictor: Predictor) -> dict[str, float]:
         """Forecast validation windows evaluation.validation_samples times, and some training windows once.
@@ -147,16 +148,26 @@ class TrajectoryEvaluator(Evaluator):
         return _evenly(len(self.test), self.KEPT_WINDOWS)
 
     def _kept_truth(self) -> Arrays:
-        """Return the arrays of the kept test windows, in raw units; their samples are still to be made."""
-        test, h = self.test[self._kept()], self.observed
+        """Return the arrays of the kept test windows, in raw units; their samples are still to be made.
+
+        test/window is their index in the test split. test/scene has the bytes of their scenes' names, with zeros up to
+        the longest, and test/frame the first frame of each.
+        """
+        kept, h = self._kept(), self.observed
+        test = self.test[kept]
         positions = test.positions[:, : h + self.predicted].astype(np.float32)
         agents = np.full(len(test), positions.shape[2]) if test.agents is None else test.agents
-        return {
+        arrays = {
             "test/observed": positions[:, :h],
             "test/future": positions[:, h:],
             "test/samples": np.zeros((self.spec.samples, *positions[:, h:].shape), np.float32),
             "test/agents": agents,
+            "test/window": self.tested[kept],
         }
+        if test.scene is not None and test.frame is not None:
+            names = np.array([self.data.scenes[scene].encode() for scene in test.scene])
+            arrays |= {"test/scene": names.view(np.uint8).reshape(len(test), -1), "test/frame": test.frame}
+        return arrays
 
 
 def _evenly(length: int, count: int | None) -> Integers:
