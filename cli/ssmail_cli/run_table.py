@@ -74,6 +74,7 @@ ENVIRONMENT_METRICS = {
         compared={
             "test/ade": "ade",
             "test/fde": "fde",
+            "test/energy": None,
             "test/min_fde_5": None,
             "test/min_fde_20": "min_fde\n_20",
             "test/min_fde_20_agent": None,
@@ -83,6 +84,7 @@ ENVIRONMENT_METRICS = {
             "test/mse_last": "mse at\nthe end",
             "test_constant_velocity/fde": "const.\nvelocity",
             "test_constant_velocity/mse_last": None,
+            "test_constant_velocity/energy": None,
             "test_copy_last/fde": None,
             "test_copy_last/mse_last": None,
             "test/diverged": None,
