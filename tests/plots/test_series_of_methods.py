@@ -43,6 +43,15 @@ def test_the_newest_spec_is_drawn_on_a_tie(store: Store, add_run: Any) -> None:
     assert chosen(store) == {"ssail": [newest, old[1]]}
 
 
+def test_a_shorter_arm_of_an_ablation_does_not_take_the_place_of_the_method(store: Store, add_run: Any) -> None:
+    method = [add_run(seed, overrides=OTHER) for seed in (0, 1)]
+    for seed in (0, 1):  # newer, with as many seeds
+        add_run(seed, overrides=[*OTHER, "curriculum.beta=0.3", "training.epochs=1"])
+    assert chosen(store) == {"ssail": method}
+    longer = [add_run(seed, overrides=[*OTHER, "training.epochs=7"]) for seed in (0, 1)]
+    assert chosen(store) == {"ssail": longer}
+
+
 def test_all_methods_are_drawn_from_one_profile(store: Store, add_run: Any) -> None:
     quick = {method: build_spec(method, "yjunction", "quick") for method in ("ssail", "gail")}
     lone = add_run(0, method="wail")

@@ -4,10 +4,11 @@ A figure compares methods, or the values of one key of the spec (an ablation); `
 By default all series of a figure are drawn from one profile, and of each seed the newest run that finished or diverged:
 
 - Methods: the profile with the most seeds. Within it each method is drawn from one spec: the one that experiments.yaml
-  gives now, else the one with the most seeds, and the newest on a tie. Other stored specs are counted in a note.
+  gives now, else the one with the most seeds, on a tie the most epochs, and then the newest. Other stored specs are
+  counted in a note.
 - An ablation: one family, that is runs whose specs differ in the ablation's key alone, whatever the values; those of
   `ssmail ablate NAME --values ...` belong to it. It is the family that experiments.yaml gives in some profile, else the
-  one with the most values times seeds, if it has at least two values, and the newest on a tie.
+  one with the most values times seeds, if it has at least two values, and on a tie likewise.
 
 Explicit run ids replace this choice: all of these runs are drawn, whatever their state. Methods keep different specs
 apart as groups of their own; the runs of an ablation have to make one family.
