@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ssmail.store import RunRow, Store
     from ssmail.store.comparison import Comparison
 
-MODEL = "test/"  # the prefix of the metrics of a model; what stands beside it has others
+MODEL = "test/"  # the prefix of a model's metrics; those of baselines have others
 LONGEST_HEADING = 8  # characters, before it is broken
 
 
@@ -43,7 +43,7 @@ class SpecsTable:
     def _beside(self) -> Iterator[dict[str, Any]]:
         """Yield a row for each baseline; several where its values depend on the spec that it was stored with.
 
-        None where a spec of the table is this baseline.
+        A baseline that is itself a spec of the table gets no second row.
         """
         for label, prefix in self.shown.beside.items():
             known = [_means(spec, self.columns, MODEL) for spec in self.specs if _method(spec) == label]
@@ -123,13 +123,13 @@ def _tables(found: "list[Comparison]", metrics: Sequence[str] | None) -> list[Sp
 
 
 def _telling(specs: "Sequence[Mapping[str, Comparison]]", columns: Sequence[str]) -> list[str]:
-    """Return the columns of models that have a value, without that of single agents where it says the same."""
+    """Return the columns with a value for some model, but not a per-agent metric that equals the joint one."""
     known = [name for name in columns if name.startswith(MODEL) and any(spec[name].known for spec in specs)]
     return [name for name in known if not all(_repeats(spec, name) for spec in specs)]
 
 
 def _repeats(spec: "Mapping[str, Comparison]", name: str) -> bool:
-    """Return whether this is a metric of single agents that is the same as that of the group."""
+    """Return whether this is a per-agent metric with the values of the joint one."""
     joint = name.removesuffix("_agent")
     return joint != name and joint in spec and spec[joint].values == spec[name].values
 
@@ -194,13 +194,13 @@ def _mean_and_std(item: "Comparison") -> str | None:
 
 
 def _means(spec: "Mapping[str, Comparison]", columns: Sequence[str], prefix: str) -> dict[str, float]:
-    """Return what the spec knows of these columns, measured of what has this prefix."""
+    """Return the means of these columns, of the model or baseline whose metrics have this prefix."""
     items = {metric: spec.get(metric.replace(MODEL, prefix, 1)) for metric in columns if metric.startswith(MODEL)}
     return {metric: item.mean for metric, item in items.items() if item is not None and item.mean is not None}
 
 
 def _agree(one: Mapping[str, float], other: Mapping[str, float]) -> bool:
-    """Return whether both have the same values, but for rounding, where both have one."""
+    """Return whether the metrics that both have are equal up to rounding."""
     return all(math.isclose(one[metric], other[metric], rel_tol=1e-5) for metric in one.keys() & other.keys())
 
 

@@ -7,7 +7,16 @@ import typer
 
 from ssmail_cli import options
 from ssmail_cli.artifacts import ArtifactsGiven
-from ssmail_cli.import_data import AgentColumn, FrameColumn, SceneColumn, XColumn, YColumn, ZColumn, seconds
+from ssmail_cli.import_data import (
+    AgentColumn,
+    FrameColumn,
+    SceneColumn,
+    StepSeconds,
+    XColumn,
+    YColumn,
+    ZColumn,
+    seconds,
+)
 from ssmail_cli.output import note, say, write_json
 
 if TYPE_CHECKING:
@@ -54,10 +63,7 @@ def forecast(
     x: XColumn = None,
     y: YColumn = None,
     z: ZColumn = None,
-    dt: Annotated[
-        float | None,
-        typer.Option("--dt", help="Seconds of a step; with it, --frame may be a column of times.", show_default=False),
-    ] = None,
+    dt: StepSeconds = None,
     model: ModelOption = "best",
     expert_set: DataOption = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite the file when it exists.")] = False,

@@ -38,6 +38,10 @@ ZColumn = Annotated[
     str | None,
     typer.Option("--z", help="Column with the third coordinate; '' for none.", show_default=PRESENT.format("z")),
 ]
+StepSeconds = Annotated[
+    float | None,
+    typer.Option("--dt", help="Seconds of a step; with it, --frame may be a column of times.", show_default=False),
+]
 
 
 def import_data(
@@ -52,12 +56,7 @@ def import_data(
     x: XColumn = None,
     y: YColumn = None,
     z: ZColumn = None,
-    dt: Annotated[
-        float | None,
-        typer.Option(
-            "--dt", help="Seconds of a step, for speeds; with it, --frame may be a column of times.", show_default=False
-        ),
-    ] = None,
+    dt: StepSeconds = None,
     window: Annotated[int, typer.Option("--window", min=2, help="Frames of a window.")] = 50,
     observed: Annotated[
         int | None,

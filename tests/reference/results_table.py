@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ssmail.config.experiments import build_spec
 from ssmail.config.names import METHODS
+from ssmail.plots.run_groups import Family, by_spec
 from ssmail.store import Store
 from ssmail.store.comparison import Comparison, compare_runs
 
@@ -22,28 +23,20 @@ BASELINE = "constant velocity"
 def rows(store: Store) -> dict[str, str]:
     """Return the row of each method that the database has, and of constant velocity, by its first cell.
 
-    Of several specs of a method it is the one that experiments.yaml gives now, else the one with the most epochs.
+    Of several specs of a method it is the one that figures prefer.
     """
     runs = [run for run in store.runs(environment="yjunction") if run.state.settled]
     found: dict[str, str] = {}
     for method in METHODS:
         own = [run for run in runs if run.method == method]
         current = build_spec(method, "yjunction", "quick").hash()
-        specs = sorted(
-            {run.spec_hash for run in own},
-            key=lambda spec: (spec == current, max(epochs(run.spec) for run in own if run.spec_hash == spec)),
-        )
-        for spec in specs[-1:]:
-            chosen = [run for run in own if run.spec_hash == spec]
+        families = [Family(tuple(found), found[0].spec_hash == current) for found in by_spec(own)]
+        if families:
+            chosen = max(families, key=lambda family: family.rank).runs
             found[method] = row(method, compare_runs(store, chosen, [f"test/{name}" for name in DECIMALS]))
             names = [f"test_constant_velocity/{name}" for name in DECIMALS]
             found.setdefault(BASELINE, row(BASELINE, compare_runs(store, chosen, names)))
     return found
-
-
-def epochs(spec: Mapping[str, object]) -> int:
-    training = spec["training"]
-    return int(training["epochs"]) if isinstance(training, Mapping) else 0
 
 
 def row(name: str, found: list[Comparison]) -> str:

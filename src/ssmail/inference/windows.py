@@ -16,7 +16,7 @@ from ssmail.data.importing.cutting import LARGEST_SET, MOST_AGENTS, cut
 from ssmail.data.importing.rows import quoted
 from ssmail.data.importing.sources import TABLES, find_files, read_files
 from ssmail.data.importing.tables import Columns
-from ssmail.data.importing.tracks import LARGEST_FRAME, make_tracks
+from ssmail.data.importing.tracks import LARGEST_FRAME, has_times, make_tracks
 from ssmail.data.npz_file import LARGEST_FILE, Header, NpzFile
 from ssmail.data.trajectories import ExpertSet, Floats, Integers
 from ssmail.errors import InputError
@@ -33,8 +33,8 @@ _SET_ARRAYS = {"parameters.npy", "hash.npy"}
 class Origin:
     """Where windows come from, as far as the file says.
 
-    scene: (W,) its name. start: (W,) the number of the first observed frame, in an expert set. frame, step: (W,) of a
-    table, the last observed frame, and how far it is to the next one. agent: (W, N) the names in a table.
+    scene: (W,) the name of the scene. start: (W,) the number of the first observed frame, in an expert set. In a table,
+    frame, step: (W,) the last observed frame, and how far it is to the next one; agent: (W, N) the names.
     """
 
     scene: NDArray[np.str_]
@@ -144,7 +144,7 @@ def _of_tables(
         raise InputError(f"{len(found):,} scenes of up to {most:,} agents are too many at once; give them in parts")
     agents = np.full((len(found), most), "", dtype=f"U{max(map(len, rows.agents))}")
     agents[found.window, found.slot] = np.array(rows.agents)[found.names]
-    unit = table.dt if table.dt and (rows.frame % 1 != 0).any() else 1.0
+    unit = table.dt if table.dt and has_times(rows) else 1.0
     step = tracks.step[found.scene].astype(np.float64) * unit
     last = tracks.first[found.scene] * unit + (end[found.scene] - 1) * step
     origin = Origin(np.array(rows.scenes)[found.scene], frame=last, step=step, agent=agents)

@@ -1,7 +1,7 @@
 """Runs that forecast, by the data that they were trained on: recorded motion, or trajectories of the user's own.
 
 Errors on different data are not comparable, so each data set has figures and tables of its own. A figure draws one
-profile, that with the most seeds, and of each method the spec with the most seeds, the newest on a tie. Of each seed it
+profile, that with the most seeds, and of each method the spec that `run_groups.Family.rank` prefers. Of each seed it
 is the newest run that finished or diverged. Baselines are drawn as references by all figures, so runs of theirs are
 left out. Explicit run ids replace this choice: then each spec is a group of its own.
 """

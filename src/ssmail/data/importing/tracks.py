@@ -111,10 +111,15 @@ def make_tracks(rows: Rows, dt: float | None, fill_gaps: int) -> tuple[Tracks, R
     return tracks, repairs
 
 
+def has_times(rows: Rows) -> bool:
+    """Return whether the frames are times, which not all are whole numbers."""
+    return bool((rows.frame % 1 != 0).any())
+
+
 def _whole_frames(rows: Rows, dt: float | None) -> Integers:
     """Return the frames as whole numbers; times become numbers of frames."""
     frame = rows.frame
-    if (frame % 1 != 0).any():
+    if has_times(rows):
         counted = frame / (dt or 1.0)
         frame = np.rint(counted)
         wrong = np.abs(counted - frame) > (ROUNDING if dt else 0)
